@@ -1,7 +1,7 @@
 """A league: the methods of a study, ranked over all objects, and as text."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from typing import Literal, overload
@@ -40,11 +40,12 @@ from sobolev_batch.tables.text import number_text, times, wrapped
 from sobolev_batch.transform.lattice import Orders
 
 LEAGUE_NOTE = """\
-Numbers ({y}) are geometric means over the objects, at equal {x}. Their 95 % intervals leave
-out what the objects themselves differ by, and hold the errors of the numbers. A rank such as
-1-3 says which places the intervals allow. Rates are slopes over the edge length. Two methods
-differ where the permutation test of pairs says so, at the level of 5 % for all pairs together.
-Pairs are compared at the sizes and over the objects that both have."""
+Numbers ({y}) are geometric means over the objects, at equal {x}. Their 95 % intervals tell
+how methods compare: they hold the errors of the numbers, and not that some objects are harder
+than others. A rank such as 1-3 says which places the intervals allow. Rates are slopes over
+the edge length. Two methods differ where the permutation test of pairs says so, at the level
+of 5 % for all pairs together. Pairs are compared at the sizes and over the objects that both
+have."""
 
 # The store of several objects, or stores of single objects by their names.
 AnyStores = AnyStore | Mapping[str, AnyStore]
@@ -91,7 +92,7 @@ PAIR_COLUMNS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class League:
     """The methods of a study, compared over its objects at one order. Make it by `league`.
 
@@ -113,6 +114,8 @@ class League:
 
     >>> import sobolev_batch as sb
     >>> (at_order,) = sb.league({"sphere": "storage/icosphere.zarr"}, -10)
+    >>> at_order
+    <League at order -10, over 1 object: icosphere>
     >>> at_order.x, at_order.methods, len(at_order.pairs)
     ('triangles', ('icosphere',), 0)
     """
@@ -123,12 +126,12 @@ class League:
     objects: tuple[str, ...]
     methods: tuple[str, ...]
     left_out: Mapping[str, str]
-    curves: Mapping[str, Mapping[str, Curve]] = field(repr=False)
-    known: NDArray[np.bool_] = field(repr=False)
-    sizes: Reals = field(repr=False)
-    values_at: Reals = field(repr=False)
-    errors_at: Reals = field(repr=False)
-    slopes: Reals = field(repr=False)
+    curves: Mapping[str, Mapping[str, Curve]]
+    known: NDArray[np.bool_]
+    sizes: Reals
+    values_at: Reals
+    errors_at: Reals
+    slopes: Reals
 
     @property
     def values(self) -> Reals:
@@ -198,6 +201,13 @@ class League:
         nearer = np.where(frame["ratio"] < 1, frame["method"], frame["other"])
         frame["nearer"] = np.where(frame["p"] < SIGNIFICANCE, nearer, "")
         return frame
+
+    def __str__(self) -> str:
+        """Return what `sobolev-batch table league` prints of it."""
+        return format_league([self])
+
+    def __repr__(self) -> str:
+        return f"<{self.caption}: {', '.join(self.table['method'])}>"
 
     def _repr_html_(self) -> str:
         return shown_tables(self.caption, self.table, self.pairs)
