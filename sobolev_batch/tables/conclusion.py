@@ -25,6 +25,8 @@ TableRow = Mapping[Any, Any]
 _BOUNDS = (0.05, 0.01)
 # Meshes whose numbers of triangles differ by no more than this factor are of one size.
 _SAME_SIZE = 1.2
+# More triangles make a mesh nearer by this power of their number at most: steeper rates are rare.
+_STEEPEST = 2.0
 # More rows are no verdict any more.
 _MOST_SIZES = 8
 _MOST_FAMILIES = 6
@@ -74,17 +76,21 @@ def study_verdict(
 
 
 def _of_sizes(at_order: str, at_sizes: Sequence[pd.DataFrame]) -> str:
-    """Return a sentence on which family is nearest where meshes of several families have about as many triangles."""
-    wins, leads, finer = Counter[str](), [], 0
+    """Return a sentence on which family is nearest where meshes of several families have about as many triangles.
+
+    None is where it may owe that to more triangles.
+    """
+    wins, leads = Counter[str](), list[float]()
     for members in at_sizes:
         if (closest := _nearest(members)) is not None:
             best, rivals = closest
             families = members["family"]
             if not any(members["mesh"].isin(rivals) & (families != best["family"])):
-                wins[best["family"]] += 1
                 second = members[families != best["family"]].sort_values("distance").iloc[0]
-                leads.append(second["distance"] / best["distance"] if best["resolved"] else math.inf)
-                finer += int(best["triangles"] > second["triangles"])
+                lead = second["distance"] / best["distance"] if best["resolved"] else math.inf
+                if lead > (best["triangles"] / second["triangles"]) ** _STEEPEST:
+                    wins[best["family"]] += 1
+                    leads.append(lead)
     if not wins:
         return ""
     total = len(at_sizes)
@@ -96,8 +102,6 @@ def _of_sizes(at_order: str, at_sizes: Sequence[pd.DataFrame]) -> str:
     if is_sweep and np.isfinite(leads).all():
         low, high = (times(lead, 2) for lead in (min(leads), max(leads)))
         parts.append(f"{low if low == high else f'{low} to {high}'} times nearer than the next")
-    if finer:
-        parts.append(f"with more triangles than the next{f' at {finer:,} of them' if total > 1 else ''}")
     return f"{', '.join(parts)}, {at_order}. "
 
 

@@ -65,8 +65,7 @@ def test_the_nearest_mesh_of_each_size_and_the_smallest_below_bounds() -> None:
     meshes = [("a", 100, 0.2), ("b", 110, 0.1), ("a", 400, 0.02), ("b", 390, 0.04), ("b", 4000, 0.005)]
     sentence, rows, omitted = verdict_on(frame(meshes))
     assert sentence == (
-        "b is nearest at 1 of 2 sizes, a is nearest at 1 of 2 sizes, with more triangles than the next at 2 of them, "
-        "at order −2. "
+        "b is nearest at 1 of 2 sizes, a is nearest at 1 of 2 sizes, at order −2. "
         "Of 5 meshes, b/4000 is nearest to the reference at order −2: it differs by 0.5000\xa0%\xa0±\xa00.0005\xa0%."
     )
     assert rows["100 to 110 triangles"] == [
@@ -130,15 +129,14 @@ def test_the_first_sentence_compares_meshes_of_one_size() -> None:
     meshes = [("a", 100, 0.2), ("b", 100, 0.5), ("a", 400, 0.02), ("b", 400, 0.06), ("b", 4000, 0.005)]
     sentence, _, _ = verdict_on(frame(meshes))
     assert sentence.startswith("a is nearest at each of 2 sizes, 2.5 to 3 times nearer than the next, at order −2. ")
-    # What is nearer need not be better if it is finer.
-    finer = [("a", 118, 0.2), *meshes[1:]]
-    assert (
-        "3 times nearer than the next, with more triangles than the next at 1 of them, " in verdict_on(frame(finer))[0]
-    )
-    only = [("a", 266, 0.2), ("b", 230, 0.201)]
-    assert verdict_on(frame(only, error=1e-6))[0].startswith(
-        "a is nearest at the same size, 1.005 times nearer than the next, with more triangles than the next, "
-    )
+    # A mesh that is finer and nearer is better only if it is nearer by more than its triangles explain.
+    assert verdict_on(frame([("a", 118, 0.2), *meshes[1:]]))[0].startswith("a is nearest at each of 2 sizes, 2.5 to 3 ")
+    assert verdict_on(frame([("a", 118, 0.4), *meshes[1:]]))[0].startswith("a is nearest at 1 of 2 sizes, ")
+    for more, less in (("a", "b"), ("b", "a")):
+        only = [(more, 266, 0.2), (less, 230, 0.201)]
+        assert verdict_on(frame(only, error=1e-6))[0].startswith(f"Of 2 meshes, {more}/266 is nearest")
+    fewer = [("a", 266, 0.201), ("b", 230, 0.2)]
+    assert verdict_on(frame(fewer, error=1e-6))[0].startswith("b is nearest at the same size, 1.005 times nearer than ")
     # The errors of the small ones leave open which is nearer.
     made = frame(meshes)
     made.loc[[0, 1], "error"] = 4.0
