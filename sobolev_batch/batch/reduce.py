@@ -26,7 +26,7 @@ from sobolev_batch.batch.cluster.execution import (
     side_by_side,
 )
 from sobolev_batch.batch.cluster.workers import prepare_workers
-from sobolev_batch.errors import ClusterError, InputError, MeshError, SobolevBatchError, StoreError, one_line
+from sobolev_batch.errors import ClusterError, InputError, MeshError, SobolevBatchError, one_line
 from sobolev_batch.geometry.formats.by_name import WRITERS, mesh_format
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
@@ -42,6 +42,7 @@ from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
 from sobolev_batch.sources.names import duplicate_names, label_problem, quoted
 from sobolev_batch.sources.registry import MadeMember, Member, SurfaceMember
 from sobolev_batch.store.location import Location
+from sobolev_batch.store.objects import ends_all
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import between, count, duration
@@ -250,7 +251,7 @@ def _outcomes(
             try:
                 yield search.name, in_place(_searched(search, lambda: None, lambda: 1))
             except SobolevBatchError as error:
-                if _ends_all(error):
+                if ends_all(error):
                     raise
                 yield search.name, error
         return
@@ -268,17 +269,12 @@ def _outcomes(
 
         def is_fatal(error: Exception) -> bool:
             # Without a cluster, no other mesh fares better.
-            return _ends_all(error) or (isinstance(error, ClusterError) and not cluster.cache_info().currsize)
+            return ends_all(error) or (isinstance(error, ClusterError) and not cluster.cache_info().currsize)
 
         runs = ((search.name, _searched(search, cluster, at_once)) for search in searches)
         for name, outcome in side_by_side(runs, is_fatal):
             left.discard(name)
             yield name, outcome
-
-
-def _ends_all(error: Exception) -> bool:
-    """Tell whether an error is more than that of one mesh."""
-    return isinstance(error, StoreError) or not isinstance(error, SobolevBatchError)
 
 
 def _is_small(search: RecordedSearch) -> bool:

@@ -194,7 +194,7 @@ def carry_out(
         if objects is None:
             return _summary(location, {"": _only(study, place, cluster_of, at_hand)})
         runs = _Runs(study, place, objects, cluster_of)
-        for name, outcome in side_by_side(runs.begun(), runs.is_fatal):
+        for name, outcome in side_by_side(runs.begun(), ends_all):
             runs.end(name, outcome)
         runs.tabulate()
     return _summary(location, {name: runs.ended[name] for name in study.objects if name in runs.ended})
@@ -236,10 +236,6 @@ class _Runs:
                 objects.records.write(objects.rows[name], replace(record, key=""))
             yield name, object_run.run_object(one, self.place, cluster)
 
-    def is_fatal(self, error: Exception) -> bool:
-        """Tell whether what ended the run of an object ends those of all."""
-        return ends_all(error) or not isinstance(error, SobolevBatchError)
-
     def end(self, name: str, outcome: Ended | Exception) -> None:
         """Keep how the run of an object ended."""
         if isinstance(outcome, Exception):
@@ -264,7 +260,8 @@ class _Runs:
         # Objects that could not be carried out lose their rows.
         lost = {name for name, one in ended.items() if one.record.reason} | changed.keys()
         left_out = (name for name in objects.tabulated if name in objects.rows and name not in ended)
-        if others := [name for name in left_out if not self._has_rows_of_now(name)]:
+        of_study, recorded = self.study.objects, self.recorded
+        if others := [one for one in left_out if not object_run.has_rows_of_now(of_study[one], recorded.get(one))]:
             _log.warning(
                 "%s: %d objects that this run left out, such as %s, have rows of other settings, and none in the "
                 "tables of all until a run of them", *(objects.location, len(others), quoted(others[0])),
@@ -275,9 +272,6 @@ class _Runs:
             write_all(objects.root, objects.names, changed.values(), kept)
         self._collect_records()
         objects.root.remember()
-
-    def _has_rows_of_now(self, name: str) -> bool:
-        return object_run.has_rows_of_now(self.study.objects[name], self.recorded.get(name))
 
     def _collect_records(self) -> None:
         """Collect the records of objects in pages, with the keys of those whose new rows are at the root now."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self, TypeVar
 
-from sobolev_batch.errors import DamageError, ForeignError, InputError, StoreError
+from sobolev_batch.errors import DamageError, ForeignError, InputError, SobolevBatchError, StoreError
 from sobolev_batch.sources.names import node_problem, quoted
 from sobolev_batch.store.create import list_records, record_keys, require_same_study
 from sobolev_batch.store.encoding import ROOT, group_document
@@ -205,8 +205,9 @@ def root_of(location: Location) -> Location:
 
 
 def ends_all(error: Exception) -> bool:
-    """Tell whether an error at one object would come at all: their storage fails, or is another run's."""
-    return isinstance(error, StoreError) and not isinstance(error, DamageError | ForeignError)
+    """Tell whether an error at one object, or mesh, would come at all: their storage fails, or we made a mistake."""
+    is_of_storage = isinstance(error, StoreError) and not isinstance(error, DamageError | ForeignError)
+    return is_of_storage or not isinstance(error, SobolevBatchError)
 
 
 def for_each_object(

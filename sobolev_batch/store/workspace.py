@@ -55,7 +55,7 @@ class Contents:
         return [record.quality if record else "" for record in self.records]
 
     @property
-    def failures(self) -> dict[str, str]:
+    def failed(self) -> dict[str, str]:
         """Reason of each row whose field could not be computed, by its label."""
         found = {self.labels[i]: self.records[i] for i in self.rows}
         return {label: record.reason for label, record in found.items() if record and record.status == "failed"}
@@ -76,7 +76,7 @@ class Contents:
         return ObjectRecord(
             complete=len(self.complete),
             total=len(self.rows),
-            failed=self.failures,
+            failed=self.failed,
             not_compared=self.not_compared,
             imprecise=imprecise or {},
             lost_records=tuple(self.labels[row] for row in self.unlike_tables) if imprecise is None else (),
@@ -156,7 +156,7 @@ class Workspace(Contents):
         workspace = cls.prepared(location, make_plan(study, stored_choice(location)))
         if workspace.pending and study.cache is not None and study.cache.versions_changed():
             # A program of another version makes other meshes: the study is listed again.
-            return cls.prepared(location, make_plan(study.not_listed(), stored_choice(location)))
+            return cls.prepared(location, make_plan(study.with_cache(study.cache), stored_choice(location)))
         return workspace
 
     @property

@@ -1,6 +1,5 @@
 """The choice of a lattice and a dtype for a study's fields, and how it grows where distances miss an accuracy."""
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +13,6 @@ from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.study.schema import MOST_OCTAVES
 from sobolev_batch.transform.lattice import Lattice
-
-_log = logging.getLogger(__name__)
 
 # Largest factor by which a lattice grows at a time.
 _LARGEST_GROWTH = 2.0

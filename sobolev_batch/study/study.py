@@ -302,10 +302,6 @@ class Study:
         makes_some = any(source.keeps_meshes for source in self._sources)
         return replace(self, objects=objects, cache=cache if makes_some else None)
 
-    def not_listed(self) -> Self:
-        """Return the study with objects whose members are listed anew."""
-        return replace(self, objects={name: replace(one) for name, one in self.objects.items()})
-
 
 # As functions take it.
 StudyLike = Study | str | Path
