@@ -20,7 +20,6 @@ from benchmarks.table import Row, at_most
 from benchmarks.timing import Effort, elapsed_seconds
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.status import Status
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Records
 
@@ -48,7 +47,7 @@ def tiny_meshes(effort: Effort) -> Iterator[Row]:
         ended = time.perf_counter()
         tasks = sum(record.seconds for record in Records(Store(store)).read() if record is not None)
         peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        status = elapsed_seconds(lambda: Status.from_store(store))
+        status = elapsed_seconds(lambda: sb.status(store))
         again = elapsed_seconds(lambda: sb.run(study, store, client))
         opened = elapsed_seconds(lambda: sb.open_store(store)["convergence"]["distance"].load())
         sobolev = sb.open_store(store).sobolev
@@ -99,7 +98,7 @@ def many_objects(effort: Effort) -> Iterator[Row]:
             yield Row("objects", f"{what}: wall time", f"{wall:.3g} s")
             again = _processor_seconds(partial(sb.run, study, store))
             yield Row("objects", f"{what}: a run that finds everything there", f"{again:.3g} CPU s")
-            yield Row("objects", f"{what}: status", f"{_processor_seconds(lambda: Status.from_store(store)):.3g} CPU s")
+            yield Row("objects", f"{what}: status", f"{_processor_seconds(lambda: sb.status(store)):.3g} CPU s")
             read = _processor_seconds(lambda: sb.table(store))
             yield Row("objects", f"{what}: table of all rows", f"{read:.3g} CPU s")
             shutil.rmtree(store)

@@ -68,41 +68,6 @@ class Status(Shown):
     failures: int = 0
     not_listed: tuple[str, ...] = ()
 
-    @classmethod
-    def from_store(cls, store: AnyStore) -> Status:
-        """Return the status of a store; see `sobolev_batch.status`."""
-        location = Location.parse(location_of(store))
-        objects = Objects.read(location)
-        if objects is not None:
-            run = RunRecord.read(objects.records.store)
-            tallies = dict(_tallies(objects))
-            moments = [one.finished for one in tallies.values() for _ in range(one.complete)]
-        elif Store(location).is_unfinished:
-            # Its run plans, or was ended while it did.
-            run, moments, tallies = RunRecord.read(Store(location)), [], {"": ObjectRecord()}
-        else:
-            opened = Store.open(location)
-            run, contents = RunRecord.read(opened), Contents.of_store(opened)
-            tallies = {"": contents.tally()}
-            moments = [record.finished for record in contents.records if record is not None]
-        refused = {name: one.reason for name, one in tallies.items() if one.reason}
-        listed = tallies if objects is None else {**objects.tabulated, **refused}
-        return cls(
-            store=str(location_of(store)),
-            complete=sum(one.complete for one in tallies.values()),
-            total=sum(one.total for one in tallies.values()),
-            failed=refused | labelled({name: one.failed for name, one in tallies.items()}),
-            not_compared=labelled({name: one.not_compared for name, one in tallies.items()}),
-            run=run,
-            has_tables={one.has_tables for one in tallies.values() if not one.reason} == {True},
-            silence_seconds=age_seconds(run.seen) if run is not None and run.state in _PATIENCE_SECONDS else 0.0,
-            rate=math.nan if run is None else _rate(moments, run),
-            lost_records=tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
-            not_begun=() if objects is None else tuple(name for name in objects.names if name not in tallies),
-            failures=sum(one.failures for one in tallies.values()),
-            not_listed=tuple(name for name, one in tallies.items() if one.has_tables and name not in listed),
-        )
-
     @property
     def waiting(self) -> int:
         """Number of surfaces that are neither computed nor failed."""
@@ -237,4 +202,34 @@ def status(store: AnyStore) -> Status:
     storage/icosphere.zarr: 5 of 5 complete, 0 failed, 0 to go
     done; by process ...
     """
-    return Status.from_store(store)
+    location = Location.parse(location_of(store))
+    objects = Objects.read(location)
+    if objects is not None:
+        run = RunRecord.read(objects.records.store)
+        tallies = dict(_tallies(objects))
+        moments = [one.finished for one in tallies.values() for _ in range(one.complete)]
+    elif Store(location).is_unfinished:
+        # Its run plans, or was ended while it did.
+        run, moments, tallies = RunRecord.read(Store(location)), [], {"": ObjectRecord()}
+    else:
+        opened = Store.open(location)
+        run, contents = RunRecord.read(opened), Contents.of_store(opened)
+        tallies = {"": contents.tally()}
+        moments = [record.finished for record in contents.records if record is not None]
+    refused = {name: one.reason for name, one in tallies.items() if one.reason}
+    listed = tallies if objects is None else {**objects.tabulated, **refused}
+    return Status(
+        store=str(location_of(store)),
+        complete=sum(one.complete for one in tallies.values()),
+        total=sum(one.total for one in tallies.values()),
+        failed=refused | labelled({name: one.failed for name, one in tallies.items()}),
+        not_compared=labelled({name: one.not_compared for name, one in tallies.items()}),
+        run=run,
+        has_tables={one.has_tables for one in tallies.values() if not one.reason} == {True},
+        silence_seconds=age_seconds(run.seen) if run is not None and run.state in _PATIENCE_SECONDS else 0.0,
+        rate=math.nan if run is None else _rate(moments, run),
+        lost_records=tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
+        not_begun=() if objects is None else tuple(name for name in objects.names if name not in tallies),
+        failures=sum(one.failures for one in tallies.values()),
+        not_listed=tuple(name for name, one in tallies.items() if one.has_tables and name not in listed),
+    )

@@ -58,13 +58,12 @@ class Deadline:
         signal.signal(signal.SIGTERM, _raising(SystemExit))
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as for commands in the background
             signal.signal(signal.SIGINT, _raising(KeyboardInterrupt))
-        if hasattr(signal, "pthread_kill"):  # not on Windows
-            Deadline._current = self
-            requests, wake = os.pipe()
-            os.set_blocking(wake, False)
-            sys.unraisablehook = self._raise_again
-            signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
-            threading.Thread(target=self._listen, args=(requests,), name="sobolev-batch-deadline", daemon=True).start()
+        Deadline._current = self
+        requests, wake = os.pipe()
+        os.set_blocking(wake, False)
+        sys.unraisablehook = self._raise_again
+        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+        threading.Thread(target=self._listen, args=(requests,), name="sobolev-batch-deadline", daemon=True).start()
 
     def _raise_again(self, lost: sys.UnraisableHookArgs) -> None:
         """Raise the exception of a request again that came to a finalizer, where Python ignores all exceptions."""

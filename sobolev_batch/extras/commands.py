@@ -22,7 +22,15 @@ from sobolev_batch.cli.options import PATH, Callback, ChosenOrders, location, or
 from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, Command
 from sobolev_batch.cli.table_commands import table_options
-from sobolev_batch.errors import InputError, MeshError, SobolevBatchError, StoreError, from_extra, require_writable
+from sobolev_batch.errors import (
+    InputError,
+    MeshError,
+    SobolevBatchError,
+    StoreError,
+    from_extra,
+    require_writable,
+    write_file,
+)
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.shown import reasons, together
@@ -356,11 +364,11 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis | None,
     The page needs no other files and makes no requests. What it leaves out is listed. The page of several objects
     has their league; STORE/OBJECT is the store of each, which has a page of its own.
     """
-    from sobolev_batch.extras.report.build import make_report, write_page
+    from sobolev_batch.extras.report.build import make_report
 
     require_writable(output, "the report")
     page, omissions = make_report(store, folder=folder, witnesses=meshes, up=up)
-    write_page(output, page)
+    write_file(output, page.encode(), "the report")
     echo(output)
     for omission in omissions:
         echo(f"left out: {omission}", err=True)

@@ -15,7 +15,6 @@ from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.league import League
 from sobolev_batch.geometry.surface import is_finite_number
-from sobolev_batch.parameters import check_choice
 from sobolev_batch.tables.convergence import EDGE_LENGTH
 from sobolev_batch.tables.open import AnyStore, Families, as_tree, finished_group
 
@@ -187,8 +186,6 @@ def witness(
     >>> ax = sb.plot.witness("storage/icosphere.zarr", "icosphere/1", order=-4)  # doctest: +SKIP
     """
     tree = as_tree(store)
-    if up is not None:
-        check_choice("up", up, ("x", "y", "z"))
     if limit is not None and not (is_finite_number(limit) and limit > 0):
         raise InputError(f"limit must be a positive number, found {limit!r}")
     orders = finished_group(tree, "convergence")["order"].values[:1].tolist() if order is None else [order]

@@ -351,7 +351,7 @@ class FolderStore(LocalStore):
             with suppress(FileNotFoundError):  # It was removed since.
                 is_file = file.is_file(follow_symlinks=False)
                 size = file.stat(follow_symlinks=False).st_size if is_file else 0
-                sizes[file.path[root:].replace(os.sep, "/")] = size
+                sizes[file.path[root:]] = size
         return sizes
 
 
@@ -465,9 +465,8 @@ def _remote_store(url: str, scheme: str, largest_bytes: int) -> RemoteStore:
     return store
 
 
-if hasattr(os, "register_at_fork"):  # Windows has no fork.
-    # The child has no thread that would answer.
-    os.register_at_fork(after_in_child=_remote_store.cache_clear)
+# A child has no thread that would answer.
+os.register_at_fork(after_in_child=_remote_store.cache_clear)
 
 
 @asynccontextmanager

@@ -115,6 +115,8 @@ class ProximityRecord:
 class _Line:
     """A record as one line of JSON, which begins with its row: records of rows may trade places."""
 
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
     def to_json(self, row: int) -> str:
         return json.dumps({_ROW: row, **asdict(cast(Any, self))})
 
@@ -153,8 +155,6 @@ class Record(_Line):
         numerics: Version of the numerics of the worker that computed it.
     """
 
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
-
     key: str
     status: Status
     reason: str = ""
@@ -191,8 +191,6 @@ class ObjectRecord(_Line):
         settings: Settings of the study by which its rows in the tables of all were made.
         finished: Time at which its run ended, in UTC.
     """
-
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     key: str = ""
     reason: str = ""

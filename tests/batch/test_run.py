@@ -17,7 +17,6 @@ import sobolev_batch as sb
 from sobolev_batch.batch import field_tasks, table_stage
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.status import Status
 from sobolev_batch.store import workspace
 from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import Store
@@ -290,7 +289,7 @@ def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path,
         done = wait_until(lambda: (record := RunRecord.read(store)) and record.state in ("done", "failed") and record)
         assert done
         assert done.state == "done"
-    status = Status.from_store(store_path)
+    status = sb.status(store_path)
     assert (status.complete, status.total) == (6, 6)
 
 

@@ -46,7 +46,7 @@ def running(store: Store, *finished: float, begun: float = 0.0, state: str = "ru
         Records(store).write(row, None if end is None else record)
     now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     RunRecord(state, "process 1", moment(begun), now, "fields, 3 of 5").write(store)  # type: ignore[arg-type]
-    return Status.from_store(store.path)
+    return sb.status(store.path)
 
 
 @pytest.mark.slow
@@ -62,7 +62,7 @@ def test_the_time_left_follows_from_the_last_ones_and_what_cannot_be_told_is_not
 
 @pytest.mark.slow
 def test_a_file_has_a_line_for_each_change(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    ended = Status.from_store(store.path)
+    ended = sb.status(store.path)
     one, two = running(store), running(store, 0)
     looks = [one, one, two, ended]
     monkeypatch.setattr("sobolev_batch.batch.status.status", lambda place: looks.pop(0))

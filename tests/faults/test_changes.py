@@ -21,7 +21,7 @@ from distributed import Client
 from sobolev_batch import Study, open_store, run, table, verify
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.status import Status
+from sobolev_batch.batch.status import status
 from sobolev_batch.errors import StoreError
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.metadata import SCHEMA_VERSION
@@ -194,7 +194,7 @@ def test_a_store_of_another_schema_is_refused_and_left_alone(folder: Path, store
         root.write_text(json.dumps(document))
         before = contents(store_path)
         message = f"its schema has version {version}, this program reads {SCHEMA_VERSION}; run the study"
-        for use in (open_store, Status.from_store, lambda place: run(study_of(folder), place, client)):
+        for use in (open_store, status, lambda place: run(study_of(folder), place, client)):
             with pytest.raises(StoreError, match=message):
                 use(store_path)
         assert before == contents(store_path)

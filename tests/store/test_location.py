@@ -15,7 +15,7 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
 from sobolev_batch import Study, run
-from sobolev_batch.batch.status import Status
+from sobolev_batch.batch.status import status
 from sobolev_batch.errors import SpaceError, StoreError
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location, path_in
@@ -139,7 +139,7 @@ def test_what_lies_elsewhere_is_not_read(copy: Path, key: str) -> None:
     # Whoever followed it would read for ever.
     lead_away(copy / key, "/dev/zero")
     with pytest.raises(StoreError, match=f"{key}: {LEADS_OUT}"):
-        Status.from_store(copy)
+        status(copy)
 
 
 @pytest.mark.parametrize("key", ["records/record/c", "convergence"])
@@ -191,12 +191,12 @@ def test_a_pipe_is_not_waited_for(copy: Path) -> None:
     (copy / "records" / "record" / "c" / "1").unlink()
     os.mkfifo(copy / "records" / "record" / "c" / "1")
     with pytest.raises(StoreError, match="neither a file nor a folder, in a store"):
-        Status.from_store(copy)
+        status(copy)
 
 
 def test_the_store_itself_may_be_reached_by_a_link(copy: Path, tmp_path: Path) -> None:
     (tmp_path / "link.zarr").symlink_to(copy)
-    assert Status.from_store(tmp_path / "link.zarr").complete == 5
+    assert status(tmp_path / "link.zarr").complete == 5
     assert Store.open(tmp_path / "link.zarr").labels() == Store.open(copy).labels()
 
 

@@ -21,7 +21,7 @@ from zarr.storage import MemoryStore
 
 from sobolev_batch import Study, open_store, plan, run, unlock, verify
 from sobolev_batch.batch.prune import prune
-from sobolev_batch.batch.status import Status
+from sobolev_batch.batch.status import status
 from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.store import metadata as documents
 from sobolev_batch.store.create import prepare_store
@@ -159,7 +159,7 @@ def change(store: Path, node: str, how: Callable[[Document], None]) -> None:
 def refusals(store: Path) -> set[str]:
     """What each way to read a store is told."""
     said = set()
-    for read in (open_store, Status.from_store, Store.open):
+    for read in (open_store, status, Store.open):
         with pytest.raises(StoreError) as caught:
             read(store)
         said.add(str(caught.value))
@@ -218,7 +218,7 @@ def test_tables_that_this_package_does_not_write_are_made_again_from_the_fields(
     change(copy, node, lambda document: document.update(changes))
     assert sorted(open_store(copy).children) == ["fourier", "records", "spectra"]
     assert f"{copy}: its tables are not used: {message}" in caplog.text
-    assert not Status.from_store(copy).has_tables
+    assert not status(copy).has_tables
     assert not verify(copy).is_sound
     prune(Location.parse(copy))
     assert unlock(copy) is None
@@ -247,7 +247,7 @@ def test_documents_beside_the_root_are_checked_when_they_are_read(copy: Path) ->
     path = copy / "records" / "zarr.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "node_type": "array"}))
     with pytest.raises(StoreError, match="records is 'array' of zarr format 3"):
-        Status.from_store(copy)
+        status(copy)
 
 
 def test_a_document_without_end(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -122,9 +122,6 @@ def _shielded_from_interrupts() -> Iterator[Callable[[], object]]:
     A terminal sends it to all processes at once. The driver ends, and its cluster with it; workers would only print
     where they were. What the signal mask of a thread blocks is blocked in everything that it starts.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield lambda: None
-        return
     # It starts with the first process otherwise, and unblocks the signal in the thread that does that.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

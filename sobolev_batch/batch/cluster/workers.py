@@ -11,7 +11,6 @@ import asyncio
 import logging
 import os
 import socket
-import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -333,8 +332,6 @@ def lock_gpu(devices: Sequence[str]) -> str | None:
 
     Return None where all are locked or this process has one already.
     """
-    if not sys.platform.startswith("linux"):
-        return None
     with _locking:
         for device in () if _own else devices:
             name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

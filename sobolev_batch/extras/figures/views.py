@@ -40,6 +40,7 @@ from sobolev_batch.geometry.proximity import point_distances
 from sobolev_batch.geometry.subdivision import subdivided
 from sobolev_batch.geometry.surface import normals
 from sobolev_batch.norms.causes import witness
+from sobolev_batch.parameters import check_choice
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import Families, chosen_families, finished_group
@@ -178,6 +179,8 @@ def make_views(
     those of `PAGE_LIMITS`. Return views in the order of the study, and the reason for each requested mesh without one,
     by its label. InputError where a label or family is unknown, or more meshes are named than may be shown.
     """
+    if up is not None:
+        check_choice("up", up, _AXES)
     most_meshes, most_triangles, most_values = limits
     named = matching_labels(tree, meshes)
     if len(named) > most_meshes:
@@ -208,8 +211,6 @@ def _turned(views: Sequence[MeshView], up: Axis | None = None) -> list[MeshView]
 
 def upwards(points: Reals, up: Axis | None = None) -> int:
     """Return by how many axes points (n, 3) are rolled until one axis, by default their `up_axis`, is the third."""
-    if up not in (None, *_AXES):
-        raise InputError(f"up must be one of {', '.join(_AXES)}, found {up!r}")
     return _AXES.index("z") - _AXES.index(up or up_axis(points))
 
 

@@ -13,12 +13,12 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch.batch.status import Status
+from sobolev_batch.batch.status import status
 from sobolev_batch.errors import InputError, from_extra, write_file
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import League, percent_text
-from sobolev_batch.parameters import check_choice, path_of
+from sobolev_batch.parameters import path_of
 from sobolev_batch.shown import together
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
@@ -93,25 +93,18 @@ def report(
     'report.html'
     """
     output = path_of(path)
-    write_page(output, make_report(store, folder=folder, witnesses=witnesses, up=up)[0])
+    write_file(output, make_report(store, folder=folder, witnesses=witnesses, up=up)[0].encode(), "the report")
     return output
-
-
-def write_page(path: Path, text: str) -> None:
-    """Write a page; StoreError where that cannot be done."""
-    write_file(path, text.encode(), "the report")
 
 
 def make_report(
     store: AnyStore, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis | None = None
 ) -> tuple[str, tuple[str, ...]]:
     """Return the report of a store, and what it leaves out, for people; see `report`."""
-    if up is not None:
-        check_choice("up", up, ("x", "y", "z"))
     objects = Objects.read(Location.parse(location_of(store)))
     if objects is None:
         tree = as_tree(store)
-        content = study_content(tree, Status.from_store(store))
+        content = study_content(tree, status(store))
         selection = Selection.from_store(tree)
         spectra = selection.spectra if selection.has_spectra else None
         omission = "" if spectra is None else spectra.attrs["omission"]
@@ -127,7 +120,7 @@ def make_report(
             f"{objects.location}: meshes are shown in the report of one object, such as "
             f"{objects.location.below(objects.names[0])}"
         )
-    content = league_content(objects, Status.from_store(store))
+    content = league_content(objects, status(store))
     charts = league_data(content["leagues"], content["name"], content["orders"])
     families = content["costs"][0].methods if content["costs"] else charts["families"]
     return filled("league", content, {**charts, "families": list(families), "costs": cost_data(content["costs"])})

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sobolev_batch.cli.comparison import Comparison
-from sobolev_batch.errors import from_extra
+from sobolev_batch.errors import from_extra, write_file
 from sobolev_batch.geometry.closest import signs
 from sobolev_batch.geometry.deviation import largest_deviation
 from sobolev_batch.geometry.mesh import Mesh
@@ -23,7 +23,7 @@ from sobolev_batch.testing.difference import picture_fields
 
 with from_extra("report", "a report needs"):
     from sobolev_batch.extras.figures.views import FRONT, distance_view, upwards
-    from sobolev_batch.extras.report.build import filled, numbers, view_data, write_page
+    from sobolev_batch.extras.report.build import filled, numbers, view_data
     from sobolev_batch.extras.report.content import PageTable
 
 # Points whose distances the histogram counts, on each mesh, and its bars.
@@ -91,7 +91,7 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
         "remarks": list(comparison.remarks),
         "omissions": [],
     }
-    write_page(path, filled("comparison", content, charts)[0])
+    write_file(path, filled("comparison", content, charts)[0].encode(), "the report")
 
 
 def _histogram(meshes: Sequence[Mesh], largest: float, *, signed: bool) -> tuple[dict[str, Any], float]:

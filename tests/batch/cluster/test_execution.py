@@ -28,7 +28,7 @@ from sobolev_batch.batch.cluster.execution import (
 )
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
-from sobolev_batch.batch.status import Status
+from sobolev_batch.batch.status import status
 from sobolev_batch.errors import ClusterError, DamageError, InputError, StoreError
 from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.store.layout import Store
@@ -290,9 +290,9 @@ def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path, thre
     records = Records(Store(store_path)).read()
     assert all(record is None or record.status == "complete" for record in records)
     assert sum(record is not None for record in records) >= 3
-    status = Status.from_store(store_path)
-    assert status.run is not None
-    assert (status.run.state, status.failed) == ("failed", {})
+    found = status(store_path)
+    assert found.run is not None
+    assert (found.run.state, found.failed) == ("failed", {})
     again = run(study, store_path, threads)
     assert (len(again.reused) >= 3, again.failed) == (True, {})
 

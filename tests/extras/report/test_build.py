@@ -286,7 +286,7 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
 
 @pytest.mark.slow
 def test_lacking_comparisons_have_a_section(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    status = replace(Status.from_store(store), not_compared={"files/good": "no proximity: <i>changed</i>"})
+    status = replace(sb.status(store), not_compared={"files/good": "no proximity: <i>changed</i>"})
     monkeypatch.setattr(Status, "from_store", lambda _: status)
     text, _ = make_report(store, folder=folder)
     assert "1 mesh lacks a comparison" in text
