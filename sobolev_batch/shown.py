@@ -64,10 +64,10 @@ def reasons(name: str, by_label: Mapping[str, str]) -> Iterable[tuple[str, str]]
         yield name, f"and {len(by_label) - _MOST_ALIKE:,} more"
 
 
-def few_of(labels: Sequence[str]) -> str:
+def few_of(labels: Sequence[str], most: int = _MOST_NAMED) -> str:
     """Return a few labels, and how many more there are."""
-    more = len(labels) - _MOST_NAMED
-    return ", ".join(labels[:_MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
+    more = len(labels) - most
+    return ", ".join(labels[:most]) + (f" and {more:,} more" if more > 0 else "")
 
 
 def together(by_label: Mapping[str, str]) -> dict[str, str]:

@@ -458,8 +458,7 @@ def _size_of(path: PurePosixPath, name: str) -> str:
 
 def _objects_text(names: Iterable[str]) -> str:
     shown = [*names]
-    more = f" and {len(shown) - _MOST_OBJECTS} more" if len(shown) > _MOST_OBJECTS else ""
-    return f"{len(shown)} object{'s' * (len(shown) != 1)}: {', '.join(shown[:_MOST_OBJECTS])}{more}"
+    return f"{len(shown)} object{'s' * (len(shown) != 1)}: {few_of(shown, _MOST_OBJECTS)}"
 
 
 def _filled(piece: str, **values: object) -> str:

@@ -15,7 +15,7 @@ from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import ALONE, joined, notes_of_left_out, remarks, tables_of
 from sobolev_batch.tables.open import AnyStore, as_tree, source_of, stores_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
-from sobolev_batch.tables.smallest import smallest_of
+from sobolev_batch.tables.smallest import remark, smallest_of
 from sobolev_batch.tables.text import count, minus, percent, spread, times, wrapped
 
 # A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
@@ -189,14 +189,8 @@ def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Tabl
     for bound in _BOUNDS:
         frame = smallest_of(rows, bound)
         for row in frame[frame["family"].isin(families)].to_dict(orient="records"):
-            label = f"below {100 * bound:g} %: {row['family']}"
-            open_ones = f"errors leave open {few_of(row['undecided'])}" if row["undecided"] else ""
-            if row["mesh"]:
-                yield _row(label, row, open_ones)
-            else:
-                amount = percent(row["nearest_relative"], row["nearest_relative_error"])
-                closest = f"{row['nearest']} has {amount}" if row["nearest"] else ""
-                yield _absent(label, "; ".join(filter(None, ("none", closest, open_ones))))
+            label, text = f"below {100 * bound:g} %: {row['family']}", remark(row, few_of(row["undecided"]))
+            yield _row(label, row, text) if row["mesh"] else _absent(label, f"none; {text}")
 
 
 def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[TableRow]:

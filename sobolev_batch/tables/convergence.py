@@ -272,9 +272,9 @@ def left_out(store: AnyStore | Mapping[str, AnyStore], frames: Mapping[str, pd.D
 
 def notes_of_left_out(store: AnyStore | Mapping[str, AnyStore], frames: Mapping[str, pd.DataFrame]) -> list[str]:
     """Return a sentence on the objects of a store that have no rows, by lines; nothing where all have some."""
-    known = objects_of(store)
-    names = [name for name in known if name not in frames]
-    left = f"{len(names):,} of {len(known):,} objects {'is' if len(names) == 1 else 'are'} left out, without tables"
+    names = left_out(store, frames)
+    count = f"{len(names):,} of {len(names) + len(frames):,}"
+    left = f"{count} objects {'is' if len(names) == 1 else 'are'} left out, without tables"
     return wrapped(f"{left}: {few_of(names)}. The command status tells why.") if names else []
 
 

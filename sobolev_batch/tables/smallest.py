@@ -19,7 +19,7 @@ _RELATIVE = ["relative", "relative_error"]
 _NAMES = ["mesh", "triangles", *_RELATIVE, "nearest", *(f"nearest_{name}" for name in _RELATIVE), "undecided"]
 _NOTE = """\
 A mesh is below the bound if its relative distance plus the error of that is.
-Meshes that are smaller, and that the errors leave open, are named as undecided."""
+Smaller meshes of which the errors leave that open are named."""
 
 _UNKNOWN: dict[str, Any] = {"mesh": "", "triangles": pd.NA, "relative": math.nan, "relative_error": math.nan}
 _COLUMNS = (
@@ -87,7 +87,7 @@ def format_smallest(store: AnyStore, style: Format, orders: Sequence[float] | No
         for order, rows in frame.groupby("order", sort=False):
             caption = f"Smallest mesh below {amount} of the norm of {frame.attrs['reference']}, order {order:g}"
             records = rows.to_dict(orient="records")
-            cells = [{**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in records]
+            cells = [{**row, "mesh": row["mesh"] or "none", "remark": remark(row, row["undecided"])} for row in records]
             sections.append(Section(caption, [(_COLUMNS, cells)]))
     return rendered(style, joined(frames), sections, notes_of_left_out(store, frames) + wrapped(_NOTE))
 
@@ -108,9 +108,8 @@ def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:
     }
 
 
-def _remark(row: Mapping[Any, Any]) -> str:
-    """Return the nearest mesh of a family without one below the bound, and the undecided ones."""
+def remark(row: Mapping[Any, Any], undecided: str) -> str:
+    """Return the nearest mesh of a family without one below the bound, and those that are undecided."""
     amount = percent(row["nearest_relative"], row["nearest_relative_error"])
-    nearest = f"nearest: {row['nearest']}, {amount}" if row["nearest"] else "no distance is known"
-    undecided = f"undecided: {row['undecided']}" if row["undecided"] else ""
-    return "; ".join(filter(None, ("" if row["mesh"] else nearest, undecided)))
+    nearest = f"{row['nearest']} has {amount}" if row["nearest"] else "no distance is known"
+    return "; ".join(filter(None, ("" if row["mesh"] else nearest, undecided and f"errors leave open {undecided}")))

@@ -211,7 +211,7 @@ def test_the_fewest_triangles_win_if_any_mesh_is_near_enough(tree: xr.DataTree) 
     assert smallest_below(tree, 0.2).attrs == {"reference": "reference", "below": 0.2}
     row = smallest(tree, 0.01)
     assert (row["mesh"], row["nearest"], row["nearest_relative"], row["undecided"]) == ("", "f_1/1", 0.025, "")
-    assert "nearest: f_1/1, 2.500 % ± 0.003 %" in format_smallest(tree, "text", [-10.0], below=0.01)
+    assert "f_1/1 has 2.500 % ± 0.003 %" in format_smallest(tree, "text", [-10.0], below=0.01)
 
 
 def test_errors_leave_smaller_meshes_open(tree: xr.DataTree) -> None:

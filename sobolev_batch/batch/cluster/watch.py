@@ -22,6 +22,7 @@ from distributed.comm import CommClosedError
 
 from sobolev_batch.batch.cluster.workers import GPU
 from sobolev_batch.errors import ClusterError, LockError, StoreError, one_line
+from sobolev_batch.shown import few_of
 from sobolev_batch.store.latest_run import LOST_AFTER_SECONDS, RunRecord, RunState
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
@@ -149,8 +150,7 @@ class Watch:
             # See `task_key`.
             ours = (key if isinstance(key, tuple) and len(key) == 3 else None for key in tasks.get(address, ()))
             labels = list(dict.fromkeys(str(key[1]) if key else "a task of something else" for key in ours))
-            more = f" and {len(labels) - _MOST_NAMED} more" if len(labels) > _MOST_NAMED else ""
-            held = f", and has {', '.join(labels[:_MOST_NAMED])}{more}" if labels else ""
+            held = f", and has {few_of(labels, _MOST_NAMED)}" if labels else ""
             told.append(f"the worker {address} has said nothing since {since}{held}")
         if len(silences) > _MOST_NAMED:
             told.append(f"and {len(silences) - _MOST_NAMED} more workers have")

@@ -38,11 +38,11 @@ from sobolev_batch.extras.figures.style import (
 from sobolev_batch.extras.leagues.costs import CostLeague, objects_text
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import RELATIVE, League
+from sobolev_batch.shown import few_of
 from sobolev_batch.tables.convergence import is_sequence, label_of, sizes_of, table
 from sobolev_batch.tables.matrix import pairs_of
 from sobolev_batch.tables.open import complete_meshes, families_of, finished_group, has_times, reference_of, study_unit
 
-_MOST_NAMED = 3
 # More labels along a front would overlap.
 _MOST_LABELS = 20
 # Each horizontal axis has what a mesh lacks that has no place on it, and the slope of second-order convergence.
@@ -88,8 +88,9 @@ def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
         axes.plot([], [], "o", color="gray", markerfacecolor="white", markersize=4, label="not above its error")
     if drawn.empty:
         axes.text(0.5, 0.5, "no mesh to draw", transform=axes.transAxes, ha="center")
-    gone = [name for name in frame["family"].drop_duplicates() if name not in set(drawn["family"])]
-    set_title(axes, f"order {order:g}", _absent(frame, selection.x), _named("families not drawn: ", gone))
+    gone = [shortened(name) for name in frame["family"].drop_duplicates() if name not in set(drawn["family"])]
+    families = f"families not drawn: {few_of(gone)}" if gone else ""
+    set_title(axes, f"order {order:g}", _absent(frame, selection.x), families)
     axes.set_xlabel(escaped(label_of(selection.x, study_unit(selection.tree))))
     axes.set_ylabel("relative Sobolev distance")
 
@@ -124,13 +125,6 @@ def _absent(frame: pd.DataFrame, x: str) -> str:
     }
     reasons = [f"{count} {reason}" for reason, count in counts.items() if count]
     return f"not drawn: {', '.join(reasons)}" if reasons else ""
-
-
-def _named(words: str, names: Sequence[str]) -> str:
-    """Return words and after them the first few names; nothing without names."""
-    shown = [shortened(name) for name in names[:_MOST_NAMED]]
-    rest = [f"{len(names) - len(shown)} more"] if len(names) > len(shown) else []
-    return words + ", ".join([*shown, *rest]) if names else ""
 
 
 def _draw_slope(axes: Axes, places: Reals, values: Reals, slope: int) -> None:

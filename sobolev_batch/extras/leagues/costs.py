@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
-from sobolev_batch.shown import shown_tables
+from sobolev_batch.shown import few_of, shown_tables
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
@@ -88,8 +88,7 @@ class CostLeague:
         fronts = meshes[meshes["front"]].groupby("member", sort=False).size()
         fronts = fronts.sort_values(ascending=False, kind="stable")
         shown = [f"{name} ({n})" if len(self.objects) > 1 else str(name) for name, n in fronts.items()]
-        rest = [f"{len(shown) - _MOST_MEMBERS} more"] if len(shown) > _MOST_MEMBERS else []
-        return ", ".join([*shown[:_MOST_MEMBERS], *rest])
+        return few_of(shown, _MOST_MEMBERS)
 
     @cached_property
     def means(self) -> pd.DataFrame:
