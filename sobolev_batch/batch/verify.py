@@ -12,21 +12,11 @@ from sobolev_batch.errors import DamageError, ForeignError, LockError, StoreErro
 from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import callback
 from sobolev_batch.shown import Shown
+from sobolev_batch.store import layout
 from sobolev_batch.store.encoding import ROOT
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.latest_run import RunRecord
-from sobolev_batch.store.layout import (
-    GROUPS_OF_TASKS,
-    LABELS,
-    NUMERICS,
-    PAIRS_KEYS,
-    QUALITY,
-    RECORDS,
-    SPECTRA_KEYS,
-    TAGS,
-    Store,
-    table_names,
-)
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
 from sobolev_batch.store.objects import Objects, labelled, root_of
@@ -171,21 +161,21 @@ def _verify(store: Store, notify: Callable[[int, int], None], *, may_write: bool
     records, unread = Records(store).examine()
     damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
     tables, chunks = _damaged_tables(store), dict[tuple[str, Index], str]()
-    labels = store.labels() if LABELS not in tables else tuple(f"row {row}" for row in range(len(records)))
+    labels = store.labels() if layout.LABELS not in tables else tuple(f"row {row}" for row in range(len(records)))
     removed = store.removed
     rows = dict.fromkeys(i for i, label in enumerate(labels) if label not in removed or records[i] is not None)
     contents = Contents(store, labels, rows, records)
     if contents.has_tables:
         if not {"meshes/row", "meshes/status", "meshes/key"} & tables.keys():
             damaged = contents.unlike_tables | damaged
-        if QUALITY not in tables:
-            stored = zip(records, store.read_strings(QUALITY), strict=True)
+        if layout.QUALITY not in tables:
+            stored = zip(records, store.read_strings(layout.QUALITY), strict=True)
             # A run may have ended between a field and the tables.
             if any(record is not None and quality not in ("", record.quality) for record, quality in stored):
-                tables[QUALITY] = "it is not what records have"
+                tables[layout.QUALITY] = "it is not what records have"
         if tables.keys().isdisjoint(store.keyed_arrays()):
             chunks = _damaged_chunks(store, are_tables_sound=not tables)
-    planned = store.attributes().get("versions", {}).get(NUMERICS)
+    planned = store.attributes().get("versions", {}).get(layout.NUMERICS)
     for row, record in contents.complete.items():
         if planned is not None and record.numerics != planned and labels[row] not in removed:
             damaged[row] = f"it was computed by numerics of version {record.numerics}, and the study by {planned}"
@@ -197,7 +187,7 @@ def _verify(store: Store, notify: Callable[[int, int], None], *, may_write: bool
             withdraw_chunk(store, *place)
         if tables:
             # The next run reads all of them.
-            store.location.discard(TAGS)
+            store.location.discard(layout.TAGS)
     for (keys, index), what in chunks.items():
         tables[f"chunk {'/'.join(map(str, index))} of {keys.split('/')[0]}"] = what
     return Verification(
@@ -217,8 +207,8 @@ def _damaged_chunks(store: Store, *, are_tables_sound: bool) -> dict[tuple[str, 
         return chunks
     pairs = Pairs.tabulated(store)
     spectra = stale_chunks(store, spectrum_keys(pairs.keys, pairs.reference))
-    stale: list[tuple[str, Index]] = [(SPECTRA_KEYS, (number,)) for number in spectra]
-    stale += [(PAIRS_KEYS, tile) for tile in (pairs.stale() if PAIRS_KEYS in store.documents else ())]
+    stale: list[tuple[str, Index]] = [(layout.SPECTRA_KEYS, (number,)) for number in spectra]
+    stale += [(layout.PAIRS_KEYS, tile) for tile in (pairs.stale() if layout.PAIRS_KEYS in store.documents else ())]
     return dict.fromkeys(stale, "it is not that of the stored fields") | chunks
 
 
@@ -241,10 +231,10 @@ def _damaged_fields(store: Store, complete: Mapping[int, Record], notify: Callab
 def _damaged_tables(store: Store) -> dict[str, str]:
     """Return the damage of each small array, of tables and coordinates, of what they say together, and of the run."""
     keyed, names = store.keyed_arrays(), store.whole_arrays()
-    expected = [*names, QUALITY, *keyed] if table_names(store) else names
+    expected = [*names, layout.QUALITY, *keyed] if layout.table_names(store) else names
     groups = {name: name.split("/")[0] for name in expected}
     # Groups of tasks have the fields besides, which are many.
-    prefixes = {name if group in GROUPS_OF_TASKS else group for name, group in groups.items()}
+    prefixes = {name if group in layout.GROUPS_OF_TASKS else group for name, group in groups.items()}
     sizes = {key: size for prefix in prefixes for key, size in store.location.sizes(prefix).items()}
     incomplete = (name for name in expected if store.incomplete_chunks(name, sizes))
     damage = dict.fromkeys(incomplete, "it is not there, or not all of it")
@@ -259,5 +249,5 @@ def _damaged_tables(store: Store) -> dict[str, str]:
     try:
         RunRecord.read(store)
     except StoreError as error:
-        damage[RECORDS] = error.what if isinstance(error, DamageError) else str(error)
+        damage[layout.RECORDS] = error.what if isinstance(error, DamageError) else str(error)
     return damage

@@ -286,14 +286,11 @@ def reduce_command(
     """
     from sobolev_batch.batch.reduce import format_reductions, reduce
 
-    if scheduler and settings["workers"]:
-        raise click.UsageError("--workers is for processes on this machine; a scheduler has its own")
-
     if suffix:
         words = shlex.split(settings["method"])
         settings["method"] = {"source": "command", "command": words, "input": suffix, "output": suffix}
     tell = partial(echo, err=True) if len(files) > 1 else None
-    with client_of(scheduler, trust_network) as client:
+    with client_of(scheduler, trust_network, settings["workers"]) as client:
         found = reduce(files, client=client, on_progress=tell, **settings)
     echo_lines(format_reductions(found, style, settings["unit"]), style)
     if any(one.reason for one in found.values()):

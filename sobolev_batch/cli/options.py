@@ -99,10 +99,14 @@ def scheduler_options(*, required: bool = False) -> Callable[[Callback], Callbac
     return lambda command: scheduler(trust(command))
 
 
-def client_of(scheduler: str | None, trust_network: bool) -> AbstractContextManager[Client | None]:
-    """Return the client of a scheduler for a block, or none where none is named."""
+def client_of(
+    scheduler: str | None, trust_network: bool, *of_processes: object
+) -> AbstractContextManager[Client | None]:
+    """Return the client of a scheduler for a block, or none where none is named; settings of processes are for that."""
     from sobolev_batch.batch.cluster.clients import remote_client
 
+    if scheduler and any(of_processes):
+        raise click.UsageError("workers and their memory are of this machine; those of a --scheduler have their own")
     return remote_client(scheduler, trust_network) if scheduler else nullcontext()
 
 

@@ -85,12 +85,8 @@ def run_command(
     from sobolev_batch.tables.conclusion import format_objects, format_verdict
     from sobolev_batch.tables.convergence import format_table
 
-    if scheduler and (settings["workers"] or settings["memory"]):
-        raise click.UsageError(
-            "--workers and --worker-memory are for a cluster on this machine; the workers of a scheduler have their own"
-        )
-    parsed = as_study(study)
-    with progress_reports() as show, client_of(scheduler, trust_network) as client:
+    parsed, of_processes = as_study(study), (settings["workers"], settings["memory"])
+    with progress_reports() as show, client_of(scheduler, trust_network, *of_processes) as client:
         summary = run(parsed, store, client, on_progress=show, **settings)
     if "" in parsed.objects:
         echo_lines(format_verdict(summary.store))
