@@ -10,7 +10,7 @@ from distributed import Client
 
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
-from sobolev_batch.batch.field_costs import Sizes, is_predictable, row_seconds, size_rows
+from sobolev_batch.batch.field_costs import TaskSizes, is_predictable, row_seconds, size_rows
 from sobolev_batch.batch.object_run import ended_before, lacks_nothing
 from sobolev_batch.batch.start import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
@@ -154,7 +154,7 @@ class StudyPlan(Shown):
         study: Name of the study.
         store: Path or URL of its store.
         count: Number of its objects.
-        share: How many unfinished objects each of those stands for that were looked at: 1 unless there are many.
+        weight: How many unfinished objects each of those stands for that were looked at: 1 unless there are many.
         objects: Plan of each object that was looked at and can be carried out, by its name; that of an only object may
             be under "".
         refused: Reason for each other object, by its name.
@@ -173,7 +173,7 @@ class StudyPlan(Shown):
     study: str
     store: str
     count: int
-    share: float
+    weight: float
     objects: Mapping[str, ObjectPlan]
     refused: Mapping[str, str]
     seconds: float
@@ -195,7 +195,7 @@ class StudyPlan(Shown):
     @property
     def total_bytes(self) -> int:
         """Bytes of all stored fields, as far as objects that were looked at tell."""
-        looked_at, possible = len(self.objects), self.count - self.share * len(self.refused)
+        looked_at, possible = len(self.objects), self.count - self.weight * len(self.refused)
         return round(sum(one.total_bytes for one in self.objects.values()) * possible / max(1, looked_at))
 
     def to_table(self) -> dict[str, Any]:
@@ -208,7 +208,7 @@ class StudyPlan(Shown):
         lines = [*starmap(_beside, zip(chain(["time"], repeat("")), self.time, strict=False))]
         lines += [_beside("warning", text) for text in self.warnings]
         if "" not in self.objects:
-            looked = f", of which {len(self.objects) + len(self.refused)} were looked at" if self.share > 1 else ""
+            looked = f", of which {len(self.objects) + len(self.refused)} were looked at" if self.weight > 1 else ""
             lines.append(_beside("objects", f"{self.count:,}{looked}; {format_bytes(self.total_bytes)} of fields"))
         lines += [beside(f"{visible(name)}: ", reason) for name, reason in together(self.refused).items()]
         longest_first = sorted(self.objects.items(), key=lambda named: -named[1].processor_seconds)
@@ -259,18 +259,18 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
         yield "proximity", f"{points}; the time above leaves them out"
 
 
-def _task_lines(plan: Plan, sizes: Mapping[str, Sizes]) -> Iterator[tuple[str, str]]:
+def _task_lines(plan: Plan, sizes: Mapping[str, TaskSizes]) -> Iterator[tuple[str, str]]:
     """Yield what is computed, and the memory that it takes."""
     if sizes:
-        largest, (*_, task_bytes) = max(sizes.items(), key=lambda item: item[1][-1])
-        yield "memory", f"up to {format_bytes(task_bytes)} in a task, of {largest}"
+        largest = max(sizes, key=lambda label: sizes[label].task_bytes)
+        yield "memory", f"up to {format_bytes(sizes[largest].task_bytes)} in a task, of {largest}"
     total_bytes = format_bytes(plan.field_bytes * len(plan.rows))
     yield "storage", f"{format_bytes(plan.field_bytes)} per surface, {total_bytes} in all"
     families = f"{len(plan.study.object.families)} famil{'y' if len(plan.study.object.families) == 1 else 'ies'}"
     reference = "with the reference" if plan.reference == REFERENCE_LABEL else f"reference {plan.reference}"
     yield "study", plan.study.object.title
     yield "surfaces", f"{len(plan.rows)} in {families}, {reference}"
-    tasks = sum(len(groups) for groups, *_ in sizes.values())
+    tasks = sum(len(one.groups) for one in sizes.values())
     yield "tasks", f"{tasks} for {len(sizes)} surfaces; chunks of the lattice: {len(plan.blocks)}"
     if plan.study.pairs == "all":
         needed = PAIR_BYTES * len(plan.study.orders) * len(plan.rows) ** 2
@@ -326,7 +326,7 @@ def plan(
         workers = Workers.of_this_machine(available_cores())
     workers.require_accuracy(study.accuracy)
     bases: set[str] = set()
-    names, share = _looked_at(study, location)
+    names, weight = _looked_at(study, location)
     part = replace(study, objects={name: study.objects[name] for name in names})
 
     def planned(one: Study, place: Location) -> ObjectPlan:
@@ -335,13 +335,13 @@ def plan(
         return _plan(one, place, workers, client, bases)
 
     plans, refused = for_each_object(part, location, planned)
-    seconds, processor_seconds, time = _forecast(plans.values(), share, workers, client is None, bases)
+    seconds, processor_seconds, time = _forecast(plans.values(), weight, workers, client is None, bases)
     if refused:
         few = f"{len(refused):,} of {len(plans) + len(refused):,} objects cannot be planned, for the reasons below"
         time = (*(time if plans else ()), few)
     warnings, count = warnings_of(study, location), len(study.objects)
     return StudyPlan(
-        study.name, str(location), count, share, plans, refused, seconds, processor_seconds, time, warnings
+        study.name, str(location), count, weight, plans, refused, seconds, processor_seconds, time, warnings
     )
 
 
@@ -358,22 +358,22 @@ def _looked_at(study: Study, location: Location) -> tuple[list[str], float]:
 
 
 def _forecast(
-    objects: Collection[ObjectPlan], share: float, workers: Workers, starts_processes: bool, bases: Collection[str]
+    objects: Collection[ObjectPlan], weight: float, workers: Workers, starts_processes: bool, bases: Collection[str]
 ) -> tuple[float, float, tuple[str, ...]]:
     """Return the seconds of a run, if workers have their cores for themselves, its processor seconds, and both shown.
 
     Objects are carried out beside each other, and each stands for some.
     """
-    missing = round(share * sum(len(one.task_seconds) for one in objects))
+    missing = round(weight * sum(len(one.task_seconds) for one in objects))
     if not missing:
         lacks_tables = any(one.lacks_tables for one in objects)
         text = "no field is missing, and tables follow from them" if lacks_tables else "nothing is missing"
         return 0.0, 0.0, (text,)
-    work = share * sum(one.processor_seconds for one in objects)
+    work = weight * sum(one.processor_seconds for one in objects)
     processes = start = 0.0
     if starts_processes:
         processes, start = _PROCESS_SECONDS * slowness() * (1 + len(workers.members)), _CLUSTER_SECONDS
-    alone = sum(one.planning_seconds for one in objects) if len(objects) == share == 1 else 0.0
+    alone = sum(one.planning_seconds for one in objects) if len(objects) == weight == 1 else 0.0
     seconds = start + max(alone + (work - alone) / workers.threads, *(one.shortest_seconds for one in objects))
     all_work = processes + work
     fields = f"{missing:,} missing field{'s' * (missing != 1)}"
@@ -382,7 +382,7 @@ def _forecast(
         f"about {duration(seconds, digits=2)} for {fields}, with {tasks}",
         f"{duration(all_work, digits=2)} of processor time; the speed is that of {' and '.join(sorted(bases))}",
     )
-    if unknown := round(share * sum(len(one.unknown) for one in objects)):
+    if unknown := round(weight * sum(len(one.unknown) for one in objects)):
         lines += (f"besides, programs and searches make {unknown:,} of the meshes, and their time is not known",)
     return seconds, all_work, lines
 
@@ -412,7 +412,7 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
         dtype=plan.choice.dtype,
         similarity=plan.similarity,
         field_bytes=plan.field_bytes,
-        memory_bytes={label: task_bytes for label, (*_, task_bytes) in sizes.items()},
+        memory_bytes={label: one.task_bytes for label, one in sizes.items()},
         task_seconds=seconds,
         unknown=tuple(row.label for row in plan.rows if row.label in seconds and not is_predictable(row)),
         planning_seconds=planning_seconds,

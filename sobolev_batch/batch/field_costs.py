@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,10 +29,16 @@ _ROW_SECONDS, _TRIANGLE_SECONDS = 0.015, 5e-6
 _COMPARING_SECONDS = 0.3
 # Groups of blocks of the lattice. The blocks of a group are computed in one task.
 BlockGroups = tuple[tuple[Block, ...], ...]
-# The groups of a row, the memory that one transform may take besides mesh and block, and that of a task.
-Sizes = tuple[BlockGroups, float, float]
 # Tasks that compare their surface with the reference load it too, unless it has more triangles.
 _LARGEST_REFERENCE = 3 << 20
+
+
+class TaskSizes(NamedTuple):
+    """What the tasks of a row take: its groups, the memory of one transform besides mesh and block, and of a task."""
+
+    groups: BlockGroups
+    allowed_bytes: float
+    task_bytes: float
 
 
 def is_predictable(row: Row) -> bool:
@@ -39,11 +46,11 @@ def is_predictable(row: Row) -> bool:
     return math.isfinite(row.member.expected_size().factor)
 
 
-def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, Sizes], dict[str, str]]:
+def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, TaskSizes], dict[str, str]]:
     """Return what the tasks of rows take, by their labels, and the reason for each row that fits into no worker."""
     beyond = _memory_beyond(plan)
 
-    def sizes_for(size: ExpectedSize) -> Sizes:
+    def sizes_for(size: ExpectedSize) -> TaskSizes:
         return size_tasks(plan.blocks, plan.transform, size, workers, len(rows), beyond)
 
     # Where not even a mesh without triangles fits, the lattice is too large: a ClusterError for all rows.
@@ -82,7 +89,7 @@ def size_tasks(
     workers: Workers,
     rows: int,
     beyond: tuple[Block, float],
-) -> Sizes:
+) -> TaskSizes:
     """Fit a row's tasks into the memory of workers.
 
     Each task holds the mesh. Its transform adds up batches of points, as large as the memory allows. Every task is kept
@@ -106,7 +113,7 @@ def size_tasks(
     count = min(len(blocks), max(1, math.ceil(2 * workers.threads / max(rows, 1))))
     ends = [len(blocks) * k // count for k in range(count + 1)]
     groups = tuple(tuple(blocks[first:last]) for first, last in pairwise(ends))
-    return groups, allowed_bytes, max(loading_bytes, computing_bytes)
+    return TaskSizes(groups, allowed_bytes, max(loading_bytes, computing_bytes))
 
 
 def row_seconds(plan: Plan, row: Row) -> float:

@@ -49,7 +49,7 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
             groups, allowed_bytes, task_bytes = sizes[row.label]
             yield _field_task(Job.for_row(plan, row, store, i, allowed_bytes, reference), groups, task_bytes)
 
-    projected_bytes = max((task_bytes for *_, task_bytes in sizes.values()), default=0.0)
+    projected_bytes = max((one.task_bytes for one in sizes.values()), default=0.0)
     seconds = {rows[i].label: row_seconds(plan, rows[i]) for i in pending if is_predictable(rows[i])}
     most = max(1, len(sizes) // (2 * workers.threads))
 

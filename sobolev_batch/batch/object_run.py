@@ -107,10 +107,9 @@ def _settings_of(one: StudyObject) -> dict[str, Any]:
 
 
 def _without_sizes(family: Mapping[str, Any]) -> dict[str, Any]:
-    def is_size(key: str, value: Any) -> bool:
-        return key not in _VECTORS and isinstance(value, list) and all(isinstance(one, Real) for one in value)
-
-    return {key: value for key, value in family.items() if not is_size(key, value)}
+    lists = {key: value for key, value in family.items() if key not in _VECTORS and isinstance(value, list)}
+    sizes = {key for key, value in lists.items() if all(isinstance(one, Real) for one in value)}
+    return {key: value for key, value in family.items() if key not in sizes}
 
 
 def has_rows_of_now(one: StudyObject, record: ObjectRecord | None) -> bool:
@@ -197,7 +196,7 @@ def _is_small(workspace: Workspace, workers: Workers) -> bool:
     if study.backend == "gpu" or study.pairs == "all" or not all(map(is_predictable, rows)):
         return False
     sizes, refused = size_rows(plan, rows, workers)
-    is_little = all(task_bytes <= workers.allowed_bytes_per_task for *_, task_bytes in sizes.values())
+    is_little = all(one.task_bytes <= workers.allowed_bytes_per_task for one in sizes.values())
     return not refused and is_little and sum(row_seconds(plan, row) for row in rows) < _SMALL_SECONDS
 
 

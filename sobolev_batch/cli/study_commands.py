@@ -23,13 +23,13 @@ from sobolev_batch.cli.output import echo, echo_lines, echo_result, progress_rep
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, cli
 from sobolev_batch.errors import InputError
 from sobolev_batch.plugins import COMMANDS, extra
+from sobolev_batch.shown import reasons
 from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
     from sobolev_batch.store.location import Location
 
-# Lines about distances that are less accurate than requested, and about objects.
-_MOST_IMPRECISE, _MOST_OBJECTS = 10, 10
+_MOST_OBJECTS = 10
 
 
 _study_argument = click.argument("study", type=PATH)
@@ -109,10 +109,9 @@ def run_command(
         echo_lines(f"all distances: sobolev-batch table {visible(shlex.quote(summary.store))}", "shell")
     for label, reason in summary.not_compared.items():
         echo(f"{label}: {reason}", err=True)
-    for label, error in list(summary.imprecise.items())[:_MOST_IMPRECISE]:
-        echo(f"{label}: its distance has an error of {100 * error:.2g} %, more than the rtol of the study", err=True)
-    if len(summary.imprecise) > _MOST_IMPRECISE:
-        echo(f"and {len(summary.imprecise) - _MOST_IMPRECISE} more distances", err=True)
+    what = "its distance has an error of {:.2g} %, more than the rtol of the study"
+    for _, line in reasons("", {label: what.format(100 * error) for label, error in summary.imprecise.items()}):
+        echo(line, err=True)
     is_short = bool(summary.imprecise) and not (parsed.accuracy is not None and parsed.accuracy.best_effort)
     if summary.failed or summary.not_compared or is_short:
         context.exit(EXIT_SOME_FAILED)

@@ -353,4 +353,4 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
 
 def _lattice_entry(plan: Plan) -> dict[str, Any]:
     lattice = {"xi_max": plan.lattice.xi_max, "M": plan.lattice.M}
-    return {"lattice": lattice, "dtype": plan.choice.dtype, "octaves": plan.choice.octaves}
+    return {"lattice": lattice, "dtype": plan.choice.dtype, "octaves": plan.tail and plan.tail.to_dict()}

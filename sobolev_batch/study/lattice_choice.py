@@ -47,11 +47,6 @@ class LatticeChoice:
     tail: TailSampling | None = None
     compared_with: str = ""
 
-    @property
-    def octaves(self) -> dict[str, Any] | None:
-        """The sampling of the octaves as a dictionary; None without octaves."""
-        return None if self.tail is None else self.tail.to_dict()
-
     def to_dict(self) -> dict[str, Any]:
         """Return the choice as a dictionary, without the octaves."""
         others = {name: getattr(self, name) for name in ("dtype", "transform_dtype", "closest", "reasons", "basis")}

@@ -234,8 +234,7 @@ def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[flo
         sentences, rows, omitted = study_verdict(frame, reasons.to_dict(), "{:g}".format)
         names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
         for_programs[name] = pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"})
-        blank = {"mesh": "", "relative": math.nan, "triangles": pd.NA}
-        full = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows]
+        full = [{"remark": row.get("absent"), **row, "absent": ""} for row in rows]
         sections += [Section(f"Object {name}")] if name else []
         sections.append(Section(sentences=[line for sentence in sentences for line in wrapped(sentence)]))
         sections += [

@@ -123,7 +123,7 @@ def _section(tree: xr.DataTree, distances: xr.Dataset) -> Section:
     kept = {str(j): labels.index(other) + 1 for j, other in enumerate(others) if any(str(j) in row for row in rows)}
     columns = [Column("label", ""), *(Column(j, str(number)) for j, number in kept.items())]
     caption = f"Sobolev distances of order {distances['order'].item():g}, {unit}"
-    return Section(caption, [(columns, [dict.fromkeys(kept, "") | row for row in rows])])
+    return Section(caption, [(columns, rows)])
 
 
 def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Reals, str]:

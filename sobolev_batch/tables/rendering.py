@@ -55,8 +55,8 @@ class Column:
     is_marked: bool = False
 
     def text(self, row: Mapping[Any, Any]) -> str:
-        """Return the cell of a row of the frame; it is empty where the value is missing."""
-        value = row[self.name]
+        """Return the cell of a row of the frame; it is empty where the value, or the column, is missing."""
+        value = row.get(self.name)
         if value is None or value is pd.NA or (isinstance(value, float) and math.isnan(value)):
             return ""
         return self.format(value, row[self.error]) if self.error else self.format(value)

@@ -164,7 +164,7 @@ def test_of_many_objects_some_are_looked_at(tmp_path: Path, monkeypatch: pytest.
     assert named == [f"{name} ({k} of 16)" for k, name in enumerate(looked, 1)]
     places = [names.index(name) for name in looked]
     assert (len(places), places[0], places[-1], {*np.diff(places)}) == (16, 0, 39, {2, 3})
-    assert (found.count, found.share) == (40, 2.5)
+    assert (found.count, found.weight) == (40, 2.5)
     assert found.total_bytes == 40 * found.objects["ball00"].total_bytes
     assert "for 200 missing fields" in str(found)
     assert re.search("^objects: +40, of which 16 were looked at; ", str(found), re.M)
