@@ -38,7 +38,6 @@ from sobolev_batch.visible import visible
 _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
 # Objects that a plan looks at: the choice of a lattice takes seconds.
 _MOST_OBJECTS = 16
-# Columns of several objects.
 _SUMMARY = ("object", "missing", "CPU time", "memory", "storage", "M + octaves")
 # Stored fields tell the speed if there are as many.
 _FEWEST_RECORDS = 3

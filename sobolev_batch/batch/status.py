@@ -22,7 +22,6 @@ from sobolev_batch.visible import visible
 
 # Runs count as lost after this time. One that waits for a busy cluster has no heartbeat.
 _PATIENCE_SECONDS = {"running": LOST_AFTER_SECONDS, "submitted": 600.0}
-# Finished surfaces from which a rate can be told.
 _FEWEST_FOR_RATE = 3
 
 

@@ -24,7 +24,6 @@ from sobolev_batch.study.study import Study, StudyLike
 
 _log = logging.getLogger(__name__)
 
-# Time within which the scheduler has to take a study.
 _ACCEPTANCE_SECONDS = 60.0
 _POLL_SECONDS = 0.05
 

@@ -213,7 +213,6 @@ def _damaged_chunks(store: Store, *, are_tables_sound: bool) -> dict[tuple[str, 
 
 
 def _damaged_fields(store: Store, complete: Mapping[int, Record], notify: Callable[[int, int], None]) -> dict[int, str]:
-    """Return the damage of each field, by its row."""
     whole = Fields(store).complete_rows() if complete else set()
 
     def damage_of(row: int) -> str:

@@ -355,7 +355,6 @@ class Comparison:
 
 
 def _moved(mesh: Mesh, motion: Reals) -> Mesh:
-    """Return a mesh after a rigid motion (4, 4)."""
     turn, shift = motion[:3, :3], motion[:3, 3]
     x, y, z = (-shift @ turn).tolist()
     return mesh.moved(1.0, (x, y, z), turn)
@@ -411,7 +410,6 @@ def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh], unit
 
 
 def _settings_text(attributes: Mapping[str, Any]) -> str:
-    """Return what was chosen for an accuracy, on one line."""
     text = f"xi_max {attributes['xi_max']:.4g}, M {attributes['M']}, {attributes['dtype']}"
     if attributes["octaves"]:
         octaves = f"{attributes['octaves']} octave{'s' * (attributes['octaves'] != 1)}"

@@ -169,7 +169,6 @@ def info_command(context: click.Context, files: tuple[Path, ...], style: str) ->
 
 
 def _fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is known of a mesh, for people."""
     ends = list(zip("xyz", *facts["box"], strict=True))
     size = max(high - low for _, low, high in ends)
     # Far from the origin, coordinates need more digits.

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 PATH = click.Path(path_type=Path)
 Callback = TypeVar("Callback", bound=Callable[..., Any])
-# The value of the option --order.
 ChosenOrders = tuple[float, ...] | None
 
 

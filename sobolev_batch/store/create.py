@@ -210,7 +210,6 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
 
 
 def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
-    """Return the keys of the radial spectra of all rows, without their chunks."""
     axis, rows = RadialAxis(plan.lattice, plan.tail), len(mesh)
     step = min(max(1, _SPECTRA_BYTES // (8 * len(axis))), _MOST_SPECTRA, 1 << (rows - 1).bit_length())
     columns = {

@@ -64,7 +64,6 @@ NUMERICS = "numerics"
 DIGEST, UNFINISHED, OBJECTS, REMOVED = "digest", "unfinished", "objects", "removed"
 # This key at the root in object storage has the SHA-256 of keys below the digest, and what listings say of these.
 TAGS = "tags.json"
-# What a reader finds first.
 DESCRIPTION = (
     "Begin with the group convergence: distances of meshes to their reference. To read all groups: "
     'xarray.open_datatree(store, engine="zarr"), or sobolev_batch.open_store(store)'

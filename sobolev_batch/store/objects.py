@@ -23,7 +23,6 @@ from sobolev_batch.study.study import Study
 Result = TypeVar("Result")
 # What a root has beside its objects.
 _AT_ROOT = frozenset({ROOT, RECORDS, TAGS, *LOCK_KEYS, *TABLES_OF_ALL})
-# What a reader finds first.
 _DESCRIPTION = (
     "Begin with the group convergence: distances of all objects' meshes to their references. Each object has a store "
     'of its own below this one. To read all its groups: xarray.open_datatree(store + "/NAME", engine="zarr"), or '

@@ -14,7 +14,6 @@ from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.study.schema import MOST_OCTAVES
 from sobolev_batch.transform.lattice import Lattice
 
-# Largest factor by which a lattice grows at a time.
 _LARGEST_GROWTH = 2.0
 # Fractions of the accuracy above which the statistical error, and that beyond the last octave, are lessened.
 _STATISTICAL_PART, _TRUNCATION_PART = 0.4, 0.4

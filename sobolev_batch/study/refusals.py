@@ -17,7 +17,6 @@ from sobolev_batch.study import schema
 
 Sections = TypeVar("Sections", bound=schema.SurfaceSections)
 
-# Most refusals of one study.
 _MOST_OFFENDERS = 10
 # Sections that are lists.
 _REPEATED = ("family", "object")
@@ -52,7 +51,6 @@ def validated(model: type[Sections], values: Mapping[str, Any]) -> Sections:
 
 
 def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
-    """Return what is wrong in the tables of a study, a message for each key."""
     messages: list[str] = []
     allowed: dict[_Key, list[str]] = {}
     items = error.errors(include_url=False)
@@ -123,7 +121,6 @@ def _section_of(key: str) -> str | None:
 
 
 def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:
-    """Return the keys that the table at a key may have."""
     if not key:
         return schema.StudyDocument.model_fields
     table = _value_at(values, key)

@@ -303,7 +303,6 @@ class Study:
         return replace(self, objects=objects, cache=cache if makes_some else None)
 
 
-# As functions take it.
 StudyLike = Study | str | Path
 
 

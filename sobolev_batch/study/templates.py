@@ -179,7 +179,6 @@ def _files(template: str, names: Sequence[str], folder: Path) -> Iterator[tuple[
 
 
 def _filled(value: Any, placeholder: str, name: str) -> Any:
-    """Return nested tables with a name in place of a placeholder."""
     if isinstance(value, str):
         return value.replace(placeholder, name)
     if isinstance(value, Mapping):

@@ -31,7 +31,6 @@ _log = logging.getLogger(__name__)
 # Names of families, or globs of names; None is all of them.
 Families = str | Sequence[str] | None
 
-# A store as functions for its readers take it.
 AnyStore = str | Path | Location | xr.DataTree
 
 # Entries of the encoding of a tree: where it was opened, and the digest of its tables then.

@@ -20,7 +20,6 @@ from sobolev_batch.tables.results import Results, table_of
 from sobolev_batch.tables.stored_spectra import spectrum_keys, stale_chunks
 from sobolev_batch.transform.lattice import Orders, check_orders
 
-# Labels of meshes: one, several, or all.
 Meshes = str | Sequence[str] | None
 
 

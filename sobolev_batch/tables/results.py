@@ -42,9 +42,7 @@ _COORDINATES = (
     *("family", "name", "is_reference", "level", "status"),
     *("vertices", "triangles", "edge_length_mean", "seconds"),
 )
-# Coordinates that only some studies have.
 _SOME_COORDINATES = {"time", *(item.name for item in fields(Cost))}
-# What orders families that go from coarse to fine.
 FROM_COARSE_TO_FINE = ("level", "triangles")
 
 

@@ -52,7 +52,6 @@ _SLOPES = {"edge_length": 2, "triangles": -1, "vertices": -1}
 _SMALLEST_SHARE = 0.005
 # Points of the largest font of labels and of shares, of the colour bar beside them, and between slanted labels.
 _LABEL_POINTS, _SHARE_POINTS, _BAR_POINTS, _SLANTED_POINTS = 7.5, 7.0, 65.0, 12.0
-# A matrix shows as many meshes at most.
 MOST_MESHES = 300
 # Points of the font of labels beside a matrix; smaller ones are left out.
 _SMALLEST_FONT, _LARGEST_FONT = 4.0, 8.0

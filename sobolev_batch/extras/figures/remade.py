@@ -35,7 +35,6 @@ from sobolev_batch.tables.open import (
 from sobolev_batch.testing.difference import VertexWitness, named_distances, order_text, witness_at_vertices
 from sobolev_batch.transform.lattice import Orders, check_orders
 
-# Labels that a message lists as examples.
 _MOST_LISTED = 3
 
 

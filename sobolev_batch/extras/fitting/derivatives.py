@@ -363,5 +363,4 @@ class _Difference:
 
 
 def _norms(gradients: Reals) -> Reals:
-    """Return the Euclidean norms (orders,) of gradients (orders, n, 3)."""
     return np.asarray(np.sqrt(np.sum(gradients**2, axis=(1, 2))))

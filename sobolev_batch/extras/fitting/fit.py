@@ -36,7 +36,6 @@ _FAR = 0.05
 _FAR_SMOOTHINGS, _FAR_STEPS = (16.0, 4.0), 0.25
 # After a step that would turn triangles over, smoothing is increased by this factor, so often at most.
 _SMOOTHER, _MOST_RETREATS = 4.0, 4
-# Growth of the Hausdorff distance that a user should know.
 _HAUSDORFF_GROWTH = 1.5
 # While the goal is larger by this factor, all edges are split. A choice of triangles came no nearer then: fits pull
 # vertices to where they are needed, and even splits leave better triangles.
@@ -45,7 +44,6 @@ _EVEN_ABOVE = 4
 _GROWTH = 2.0
 # The last factor may be a little larger, instead of a round for few triangles.
 _LAST_GROWTH = 1.15
-# Steps after each round but the last.
 _STEPS_BETWEEN = 40
 MOST_TRIANGLES = 1_000_000
 

@@ -97,7 +97,6 @@ def files_beside(data: bytes) -> tuple[str, ...]:
 
 
 def _loaded_buffers(tree: dict[str, Any], binary: bytes | None, beside: Mapping[str, bytes]) -> list[bytes]:
-    """Return the bytes of each buffer of a document."""
     buffers: list[bytes] = []
     for index, buffer in enumerate(tree.get("buffers", [])):
         uri = buffer.get("uri")

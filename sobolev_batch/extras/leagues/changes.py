@@ -155,7 +155,6 @@ def _numbers(frame: pd.DataFrame, y: str) -> pd.DataFrame:
 
 
 def _change(meshes: pd.DataFrame) -> dict[str, object]:
-    """Return the change of one method at one order."""
     by_object = meshes.groupby("object", sort=False)[["log_ratio", "log_error"]].mean()
     units = by_object if len(by_object) > 1 else meshes
     ratios, errors = units["log_ratio"].to_numpy(), units["log_error"].to_numpy()

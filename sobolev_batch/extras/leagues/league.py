@@ -53,7 +53,6 @@ AnyStores = AnyStore | Mapping[str, AnyStore]
 RELATIVE = "relative"
 # Objects that serve no league are told with their reasons, so many of them.
 _MOST_REASONS = 3
-# Columns of the ends of an interval.
 ENDS = ("low", "high")
 
 

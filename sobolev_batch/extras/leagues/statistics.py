@@ -25,7 +25,6 @@ _MORE_IS_BETTER = ("fscore", "precision", "recall", "smallest_angle")
 _NEITHER = ("order", "level", "rank", "rate", "rate_error")
 # All changes of sign are tried for as many objects, and as many random ones for more.
 _MOST_ENUMERATED, _DRAWS, _SEED = 14, 20_000, 0
-# Signs that are in memory at a time.
 _MOST_SIGNS = 1 << 22
 
 

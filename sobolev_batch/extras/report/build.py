@@ -168,7 +168,6 @@ def _shown(value: Any) -> Any:
 
 
 def _shown_data(value: Any) -> Any:
-    """Return data of charts with texts as they are shown."""
     match value:
         case dict():
             return {key: _shown_data(entry) for key, entry in value.items()}
@@ -274,7 +273,6 @@ def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list
 
 
 def _drawable(tree: xr.DataTree) -> pd.DataFrame:
-    """Return the rows of `table` that have a place on logarithmic axes."""
     frame = with_remarks(table(tree)).sort_values("edge_length", kind="stable")
     return frame[(frame["relative"] > 0) & frame["edge_length"].notna()]
 
