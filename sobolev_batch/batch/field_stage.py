@@ -104,8 +104,8 @@ def _field_task(job: Job, groups: BlockGroups, projected_bytes: float) -> Task:
     """Return the task that computes and stores a field, after those that it depends on; it gives the record."""
     needs_gpu = job.backend == "gpu"
     if len(groups) == 1:
-        return Task(compute_mesh, (job, *groups), projected_bytes, needs_gpu, job.index, job.row.label, stage="field")
+        return Task(compute_mesh, (job, *groups), projected_bytes, needs_gpu, job.row, job.planned.label, stage="field")
     parts = [(blocks, False) for blocks in groups] + [((), True)] * (job.tail is not None)
-    label, stage = job.row.label, "part of field"
+    label, stage = job.planned.label, "part of field"
     tasks = [Task(compute_parts, (job, *part), projected_bytes, needs_gpu, label=label, stage=stage) for part in parts]
-    return Task(finish_mesh, (job, tasks), row=job.index, label=label, stage="field")
+    return Task(finish_mesh, (job, tasks), row=job.row, label=label, stage="field")

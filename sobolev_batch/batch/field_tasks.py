@@ -53,16 +53,17 @@ class Job:
     """The field of one row, and where it is stored.
 
     Attributes:
+        row, planned: Row of the store, and what the plan has for it.
         lattice, transform, orders, similarity, backend, tail: What all rows share; see `Plan`.
         distance_target: Accuracy that the field is computed for, if the study has one.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
-        reference: Row of the reference, where surfaces are compared beyond the lattice; None if it is too large.
+        reference: The reference, where surfaces are compared beyond the lattice; None if it is too large.
         numerics: Version of the numerics that the key of the row has.
     """
 
     store: Store
-    index: int
-    row: Row
+    row: int
+    planned: Row
     lattice: Lattice
     transform: TransformSettings
     orders: tuple[float, ...]
@@ -78,15 +79,15 @@ class Job:
     def key(self) -> str:
         """Key of the record of this field: that of the row, where this process computes as the study was planned."""
         is_same = self.numerics == NUMERICS_VERSION
-        return self.row.key if is_same else f"{self.row.key} by numerics {NUMERICS_VERSION}"
+        return self.planned.key if is_same else f"{self.planned.key} by numerics {NUMERICS_VERSION}"
 
     @classmethod
     def for_row(
-        cls, plan: Plan, row: Row, store: Store, index: int, allowed: float | None = None, reference: Row | None = None
+        cls, plan: Plan, one: Row, store: Store, row: int, allowed: float | None = None, reference: Row | None = None
     ) -> Self:
         """Return the job of a row of a plan."""
         shared = plan.lattice, plan.transform, plan.study.orders, plan.similarity, plan.study.backend, plan.tail
-        return cls(store, index, row, *shared, plan.distance_target(row), allowed, reference)
+        return cls(store, row, one, *shared, plan.distance_target(one), allowed, reference)
 
     @property
     def execution(self) -> Execution:
@@ -95,7 +96,7 @@ class Job:
 
     def load(self) -> Surface:
         """Load the surface, in the study's unit; MeshError where it is not the one that the study was planned with."""
-        return self._loaded(self.row)
+        return self._loaded(self.planned)
 
     def load_reference(self) -> Surface | None:
         """Load the reference, in the study's unit; None where it is too large. See `load` for errors."""
@@ -113,9 +114,9 @@ class Job:
             _reference[key] = found
         return found
 
-    def _loaded(self, row: Row) -> Surface:
-        surface = self.similarity.apply(row.member.load())
-        if row.fingerprint and row.member.fingerprint_digest() != row.fingerprint:
+    def _loaded(self, one: Row) -> Surface:
+        surface = self.similarity.apply(one.member.load())
+        if one.fingerprint and one.member.fingerprint_digest() != one.fingerprint:
             raise MeshError("a file of it was changed while the study was going on; run the study again")
         return surface
 
@@ -127,7 +128,7 @@ class Job:
 
     def stored_record(self) -> Record | None:
         """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""
-        record = Records(self.store).read_one(self.index, of_this_run=True)
+        record = Records(self.store).read_one(self.row, of_this_run=True)
         return record if record is not None and record.completes(self.key) else None
 
     def failure_reason(self, error: Exception) -> str:
@@ -147,7 +148,7 @@ class Job:
                 "run, or by --memory-limit of dask worker"
             )
         if not isinstance(error, InputError):
-            _log.error("%s failed for a reason that is not its mesh's", self.row.label, exc_info=error)
+            _log.error("%s failed for a reason that is not its mesh's", self.planned.label, exc_info=error)
         return reason
 
 
@@ -223,7 +224,7 @@ def _store_octaves(job: Job, tail: TailSampling, surface: Surface, target: Error
         difference,
     )
     samples = np.concatenate([octave.values for octave in values])
-    checksum = Fields(job.store).write(job.index, (slice(0, len(samples)),), samples)
+    checksum = Fields(job.store).write(job.row, (slice(0, len(samples)),), samples)
     return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
 
 
@@ -232,7 +233,7 @@ def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
     cutoff = job.lattice.xi_max
     if job.reference is None or job.tail is not None:
         return None
-    if job.reference.label == job.row.label:
+    if job.reference.label == job.planned.label:
         return Remainder.between(0.0, 0.0, cutoff)
     reference = job.load_reference()
     return None if reference is None else remainder_of_flat((surface, reference), cutoff, execution=job.execution)
@@ -244,7 +245,7 @@ def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> Stor
         field = field_for(surface, lattice, target, transform, execution)
     else:
         field = compute_field(surface, lattice, transform, job.orders, execution)
-    checksum = Fields(job.store).write(job.index, lattice.place(lattice.half), field.values)
+    checksum = Fields(job.store).write(job.row, lattice.place(lattice.half), field.values)
     facts = Facts.of_surface(surface, field.points)
     return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
 
@@ -258,7 +259,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: E
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
         result = transform_block(surface, lattice, block, transform, execution, kind)
-        checksums.append(Fields(job.store).write(job.index, lattice.place(block), result.values))
+        checksums.append(Fields(job.store).write(job.row, lattice.place(block), result.values))
         probes.append(probe_block(surface, lattice, transform, block, result.values, draws, execution))
         backends.append(result.backend)
         points = result.points
@@ -272,12 +273,12 @@ def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
         key=job.key,
         numerics=NUMERICS_VERSION,
         status="complete",
-        remark=job.row.member.remark(),
+        remark=job.planned.member.remark(),
         seconds=sum(blocks.seconds for blocks in stored),
         worker=worker.address if worker else "local",
         backend=", ".join(backends),
         finished=utc_now(),
-        cost=job.row.member.cost(),
+        cost=job.planned.member.cost(),
     )
     if errors := [blocks.error for blocks in stored if blocks.error]:
         record = replace(record, status="failed", reason=errors[0])
@@ -287,6 +288,6 @@ def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
         quality = replace(qualities[0], probe=join([quality.probe for quality in qualities]), tail=tail)
         checksums = tuple(checksum for blocks in stored for checksum in blocks.checksums)
         record = replace(record, facts=stored[0].facts, quality=quality.to_json(), checksums=checksums)
-    Records(job.store).write(job.index, record)
-    _log.info("%s: %s in %.2f s by %s", job.row.label, record.status, record.seconds, record.backend)
+    Records(job.store).write(job.row, record)
+    _log.info("%s: %s in %.2f s by %s", job.planned.label, record.status, record.seconds, record.backend)
     return record

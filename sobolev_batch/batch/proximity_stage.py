@@ -87,7 +87,7 @@ def _measure(cluster: Cluster, workspace: Workspace, requested: ProximitySection
 
 def measure_proximity(
     store: Store,
-    index: int,
+    row: int,
     record: Record,
     key: str,
     pair: Sequence[tuple[Row, str]],
@@ -100,7 +100,7 @@ def measure_proximity(
     that of the reference, each with the digest of the mesh whose field is stored. A StoreError is not the mesh's fault.
     """
     # Dask has a task done again whose worker was lost with the result.
-    stored = Records(store).read_one(index)
+    stored = Records(store).read_one(row)
     if stored is not None and stored.proximity is not None and stored.proximity.completes(key):
         return stored
     started = time.perf_counter()
@@ -123,7 +123,7 @@ def measure_proximity(
             _log.error("%s: proximity failed for a reason that is not its mesh's", pair[0][0].label, exc_info=error)
         measured = ProximityRecord(key, one_line(error))
     record = replace(record, proximity=replace(measured, seconds=time.perf_counter() - started))
-    Records(store).write(index, record)
+    Records(store).write(row, record)
     return record
 
 

@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Row:
-    """One surface of a study.
+    """One surface of a study, as what a row of its store is to hold.
 
     Attributes:
         label: Family/name, or "reference"; unique in the study.

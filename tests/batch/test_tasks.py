@@ -57,7 +57,7 @@ def test_a_mesh_is_one_task_whatever_the_memory_allows(store_path: Path) -> None
     reason = compute_mesh(job_of(plan, store_path.with_name("other.zarr"), allowed_bytes=1.0), plan.blocks).reason
     assert "is what the limit of its worker leaves; raise that limit by --worker-memory" in reason
     # So little that points are added up in batches.
-    job = replace(job_of(plan, store_path, allowed_bytes=1.25e7), index=1)
+    job = replace(job_of(plan, store_path, allowed_bytes=1.25e7), row=1)
     record = compute_mesh(job, plan.blocks)
     assert record.status == "complete", record.reason
     # Batches of triangles share no nodes with each other.

@@ -22,7 +22,7 @@ def gate_of(path: Path) -> Path:
 
 def wait_and_load(job: Job) -> Surface:
     """Load the surface of a job, once its gate is open."""
-    member = job.row.member
+    member = job.planned.member
     if isinstance(member, FileMember) and gate_of(member.path).exists():
         gate_of(member.path).read_bytes()
     surface: Surface = job.load_without_gate()  # type: ignore[attr-defined]
