@@ -234,7 +234,7 @@ def test_the_axis_that_points_upwards(up: Literal["x", "y", "z"], spheres: Spher
 
 def test_an_axis_that_cannot_point_upwards_is_named() -> None:
     with pytest.raises(sb.errors.InputError, match=r"^up must be one of x, y, z, found 'up'$"):
-        views.upwards(FEET, "up")  # type: ignore[arg-type]
+        make_views(xr.DataTree(), "", up="up")  # type: ignore[arg-type]
 
 
 FEET = np.array([[x, 0, z] for x in (0, 1) for z in (0, 2)])

@@ -23,7 +23,6 @@ from selenium.webdriver.common.keys import Keys
 
 import sobolev_batch as sb
 from sobolev_batch import Study, open_store, run
-from sobolev_batch.batch.status import Status
 from sobolev_batch.cli import cli
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.extras.figures import selection
@@ -287,7 +286,7 @@ def test_large_studies_are_cut_and_say_so(store: str, folder: Path, monkeypatch:
 @pytest.mark.slow
 def test_lacking_comparisons_have_a_section(store: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     status = replace(sb.status(store), not_compared={"files/good": "no proximity: <i>changed</i>"})
-    monkeypatch.setattr(Status, "from_store", lambda _: status)
+    monkeypatch.setattr(build, "status", lambda _: status)
     text, _ = make_report(store, folder=folder)
     assert "1 mesh lacks a comparison" in text
     assert text.count('href="#lacking"') == text.count('id="lacking"') == 1
