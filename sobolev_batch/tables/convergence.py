@@ -19,6 +19,7 @@ from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import (
     AnyStore,
+    AnyStores,
     as_tree,
     doubts_of,
     finished_group,
@@ -167,9 +168,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     return joined(frames, left_out(store, frames))
 
 
-def tables_of(
-    store: AnyStore | Mapping[str, AnyStore], order: Orders | None = None, *, x: str = EDGE_LENGTH
-) -> dict[str, pd.DataFrame]:
+def tables_of(store: AnyStores, order: Orders | None = None, *, x: str = EDGE_LENGTH) -> dict[str, pd.DataFrame]:
     """Return the rows of `table` of each object that has any, by its name, "" for an only one; InputError if none has.
 
     The root of a store has the rows of all objects at the orders of the study; others come from the stores of objects.
@@ -265,12 +264,12 @@ def joined(frames: Mapping[str, pd.DataFrame], left_out: Sequence[str] = ()) -> 
     return frame
 
 
-def left_out(store: AnyStore | Mapping[str, AnyStore], frames: Mapping[str, pd.DataFrame]) -> list[str]:
+def left_out(store: AnyStores, frames: Mapping[str, pd.DataFrame]) -> list[str]:
     """Return the names of the objects of a store that have no rows."""
     return [name for name in objects_of(store) if name not in frames]
 
 
-def notes_of_left_out(store: AnyStore | Mapping[str, AnyStore], frames: Mapping[str, pd.DataFrame]) -> list[str]:
+def notes_of_left_out(store: AnyStores, frames: Mapping[str, pd.DataFrame]) -> list[str]:
     """Return a sentence on the objects of a store that have no rows, by lines; nothing where all have some."""
     names = left_out(store, frames)
     count = f"{len(names):,} of {len(names) + len(frames):,}"
@@ -279,7 +278,7 @@ def notes_of_left_out(store: AnyStore | Mapping[str, AnyStore], frames: Mapping[
 
 
 def format_table(
-    store: AnyStore | Mapping[str, AnyStore],
+    store: AnyStores,
     style: Format = "text",
     orders: Sequence[float] | None = None,
     *,

@@ -32,6 +32,8 @@ _log = logging.getLogger(__name__)
 Families = str | Sequence[str] | None
 
 AnyStore = str | Path | Location | xr.DataTree
+# The store of several objects, or of an only one; or stores of single objects by their names.
+AnyStores = AnyStore | Mapping[str, AnyStore]
 
 # Entries of the encoding of a tree: where it was opened, and the digest of its tables then.
 _SOURCE, _STATE = "source", "state"
@@ -186,7 +188,7 @@ def as_tree(store: AnyStore) -> xr.DataTree:
     return store if isinstance(store, xr.DataTree) else open_store(store)
 
 
-def stores_of(store: AnyStore | Mapping[str, AnyStore]) -> Mapping[str, AnyStore]:
+def stores_of(store: AnyStores) -> Mapping[str, AnyStore]:
     """Return the stores of objects by name, which they may be already; "" names an only object."""
     if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
         return store
@@ -195,7 +197,7 @@ def stores_of(store: AnyStore | Mapping[str, AnyStore]) -> Mapping[str, AnyStore
     return {**stores_below(Location.parse(location_of(store)))}
 
 
-def objects_of(store: AnyStore | Mapping[str, AnyStore]) -> tuple[str, ...]:
+def objects_of(store: AnyStores) -> tuple[str, ...]:
     """Return the names of a store's objects, or of stores by name; none where it is that of an only one."""
     if isinstance(store, xr.DataTree):
         return tuple(root_attribute(store, "study").get(layout.OBJECTS, ()))

@@ -8,14 +8,7 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.extras.leagues.league import (
-    ENDS,
-    RELATIVE,
-    AnyStores,
-    chosen_methods,
-    interval_text,
-    orders_of,
-)
+from sobolev_batch.extras.leagues.league import ENDS, RELATIVE, chosen_methods, interval_text, orders_of
 from sobolev_batch.extras.leagues.statistics import adjusted, errors_of_logarithms, interval, numbers_of, sign_flip_test
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.parameters import as_names
@@ -23,7 +16,7 @@ from sobolev_batch.sources.names import quoted
 from sobolev_batch.study.comparable import SIGNIFICANCE, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import table
-from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, reference_of, root_attribute, stores_of
+from sobolev_batch.tables.open import AnyStores, as_tree, finished_group, reference_of, root_attribute, stores_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import number_text, wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -47,8 +40,8 @@ _COLUMNS = (
 
 
 def compare_studies(
-    new: AnyStores | AnyStore,
-    old: AnyStores | AnyStore,
+    new: AnyStores,
+    old: AnyStores,
     order: Orders | None = None,
     *,
     y: str | Sequence[str] = RELATIVE,

@@ -34,7 +34,7 @@ from sobolev_batch.sources.names import quoted
 from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of, tables_of
-from sobolev_batch.tables.open import AnyStore, as_tree, objects_of, root_attribute, source_of
+from sobolev_batch.tables.open import AnyStores, as_tree, objects_of, root_attribute, source_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import number_text, times, wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -47,8 +47,6 @@ the edge length. Two methods differ where the permutation test of pairs says so,
 of 5 % for all pairs together. Pairs are compared at the sizes and over the objects that both
 have."""
 
-# The store of several objects, or stores of single objects by their names.
-AnyStores = AnyStore | Mapping[str, AnyStore]
 # What methods are compared by unless another number is named.
 RELATIVE = "relative"
 # Objects that serve no league are told with their reasons, so many of them.
