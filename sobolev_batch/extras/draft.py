@@ -133,16 +133,14 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     families = _families(_without_strangers(sizes, references.get("")), references)
     used = {*references.values(), *chain.from_iterable(families.values())}
     doubts = {
-        str(path): placement_doubt(extents[path], extents[references[name]])
+        str(path): doubt
         for (name, _), paths in families.items()
         for path in paths
         if {path, references[name]} <= extents.keys()
+        if (doubt := placement_doubt(extents[path], extents[references[name]]))
     }
     if "" in references:
-        doubts = {
-            **_of_finer_files(used, sizes, references[""]),
-            **{path: doubt for path, doubt in doubts.items() if doubt},
-        }
+        doubts = _of_finer_files(used, sizes, references[""]) | doubts
         lacks = "its name lacks that of the reference"
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
@@ -158,7 +156,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         len(study.object.members)
     with written(output, "the study", StudyError), output.open("x", encoding="utf-8", newline="\n") as file:
         file.write(text)
-    return StudyDraft(output, summary, left_out, {path: doubt for path, doubt in doubts.items() if doubt})
+    return StudyDraft(output, summary, left_out, doubts)
 
 
 def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[PurePosixPath, Extent], dict[str, str]]:
