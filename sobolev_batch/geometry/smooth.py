@@ -16,7 +16,8 @@ from scipy.special import roots_legendre
 from sobolev_batch.arrays import Reals, slices
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import cross_lengths
-from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Point, checked_point, is_finite_number
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Point, Similarity, is_finite_number
+from sobolev_batch.parameters import check_flags
 
 Counts = tuple[int, int]
 
@@ -65,13 +66,11 @@ class Interval:
     periodic: bool = False
 
     def __post_init__(self) -> None:
-        if not (is_finite_number(self.low) and is_finite_number(self.high) and self.low < self.high):
+        ends = self.low, self.high
+        if not (all(map(is_finite_number, ends)) and 0 < float(self.high) - float(self.low) < math.inf):
             raise InputError(f"an interval needs two finite ends in ascending order, found {self.low} and {self.high}")
-        if not isinstance(self.periodic, bool):
-            raise InputError(f"an interval is periodic or not: expected True or False, found {self.periodic!r}")
+        check_flags(periodic=self.periodic)
         vars(self).update(low=float(self.low), high=float(self.high))
-        if not math.isfinite(self.length):
-            raise InputError(f"an interval's length must be finite, found {self.low} to {self.high}")
 
     @property
     def length(self) -> float:
@@ -270,9 +269,7 @@ class ParametrisedSurface(Smooth):
         for name, interval in (("u", self.u), ("v", self.v)):
             if not isinstance(interval, Interval):
                 raise InputError(f"{name} must run over an Interval, found {interval!r}")
-        if not (is_finite_number(self.scale) and self.scale > 0):
-            raise InputError(f"the scale must be positive and finite, found {self.scale!r}")
-        checked_point(self.origin, "the origin")
+        Similarity(self.scale, self.origin)  # refuses what is none
         self._check_closed()
         _ = self.area
 

@@ -175,12 +175,10 @@ class Lattice(FrequencyLattice):
     M: int
 
     def __post_init__(self) -> None:
-        if not (is_finite_number(self.xi_max) and self.xi_max > 0):
-            raise LatticeError(f"xi_max must be a positive and finite number, found {self.xi_max!r}")
-        if not _LOWEST_XI_MAX <= self.xi_max <= 1 / _LOWEST_XI_MAX:
+        if not (is_finite_number(self.xi_max) and _LOWEST_XI_MAX <= self.xi_max <= 1 / _LOWEST_XI_MAX):
             raise LatticeError(
-                f"xi_max must lie between {_LOWEST_XI_MAX:g} and {1 / _LOWEST_XI_MAX:g}, found {self.xi_max:g}; "
-                "choose another unit of length"
+                f"xi_max must be a number from {_LOWEST_XI_MAX:g} to {1 / _LOWEST_XI_MAX:g}, found {self.xi_max!r}; "
+                "choose a unit of length in which it is"
             )
         if not is_whole_number(self.M) or self.M % 2 or not 2 <= self.M <= LARGEST_M:
             raise LatticeError(f"M must be an even integer from 2 to {LARGEST_M}, found {self.M!r}")
@@ -215,14 +213,12 @@ class Lattice(FrequencyLattice):
     def trapezoid_weights(self, block: Block) -> Reals:
         """Return the product of the `axis_weights` at each sample of a block, float64 (block.shape)."""
         x, y, z = self.axis_weights(block)
-        weights: Reals = x[:, None, None] * y[:, None] * z
-        return weights
+        return np.asarray(x[:, None, None] * y[:, None] * z)
 
     def shells(self, block: Block) -> NDArray[np.int32]:
         """Return the squared length |k|^2 of each index triple of a block, int32 (block.shape)."""
         x, y, z = (block.indices(axis).astype(np.int32) ** 2 for axis in range(3))
-        lengths: NDArray[np.int32] = x[:, None, None] + y[:, None] + z
-        return lengths
+        return np.asarray(x[:, None, None] + y[:, None] + z)
 
     @property
     def shell_count(self) -> int:
@@ -302,8 +298,7 @@ class OctaveLattice(FrequencyLattice):
         """Rotation R as a matrix (3, 3)."""
         from scipy.spatial.transform import Rotation
 
-        matrix: Reals = Rotation.from_quat(self.quaternion).as_matrix()
-        return matrix
+        return np.asarray(Rotation.from_quat(self.quaternion).as_matrix())
 
     def half_weights(self) -> Reals:
         """Return the weight of each layer of samples along the z axis, float64: 2 inside, fading to 0 across ξ_z = 0.

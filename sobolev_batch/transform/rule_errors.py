@@ -129,8 +129,7 @@ def _error_parts(
 
 def _radii(lattice: FrequencyLattice) -> Reals:
     low, high = lattice.radial_range
-    radii: Reals = low + (np.arange(RANGES) + 0.5) / RANGES * (high - low)
-    return radii
+    return np.asarray(low + (np.arange(RANGES) + 0.5) / RANGES * (high - low))
 
 
 def weight_masses(lattice: FrequencyLattice, orders: Sequence[float]) -> Reals:

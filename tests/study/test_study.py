@@ -223,7 +223,7 @@ PLACES: list[tuple[str, Any, str]] = [
 BALL = {"ball": {"source": "sphere"}}
 # Several changes at once.
 CHANGES: list[tuple[dict[str, Any], str]] = [
-    ({"lattice": None, "accuracy": {"rtol": 2.0}}, r"\[accuracy\]: rtol must lie between 0 and 1, found 2.0"),
+    ({"lattice": None, "accuracy": {"rtol": 2.0}}, r"\[accuracy\]: rtol must be a number between 0 and 1, found 2.0"),
     ({"lattice": None, "accuracy": {"rtol": 0.1, "memory": "much"}}, r"\[accuracy\]: memory must .*, found 'much'"),
     ({"lattice": None, "accuracy": {"rtol": 0.1}, "transform": {"eps": 1e-9}}, r"an \[accuracy\] chooses eps"),
     ({"lattice": None}, r"either a \[lattice\] or an \[accuracy\] is needed"),

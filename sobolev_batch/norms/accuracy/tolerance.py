@@ -17,6 +17,7 @@ from scipy.special import betainc
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError, InputError
+from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.norms import budget
 from sobolev_batch.norms.budget import Sums, Support
 from sobolev_batch.norms.estimate import NormEstimate
@@ -71,13 +72,8 @@ class Accuracy:
     floor: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, value in (("rtol", self.rtol), ("memory", self.allowed_bytes)):
-            if isinstance(value, bool) or not isinstance(value, int | float | np.floating | np.integer):
-                raise InputError(f"{name} must be a number, found {value!r}")
-        if not 0 < self.rtol < 1:
-            raise InputError(f"rtol must lie between 0 and 1, found {self.rtol!r}")
-        if not (math.isfinite(self.allowed_bytes) and self.allowed_bytes > 0):
-            raise InputError(f"memory must be a positive number of bytes, found {self.allowed_bytes!r}")
+        if not (is_finite_number(self.rtol) and 0 < self.rtol < 1):
+            raise InputError(f"rtol must be a number between 0 and 1, found {self.rtol!r}")
 
     def met(self, estimate: NormEstimate) -> NDArray[np.bool_]:
         """Tell which numbers have an error within rtol of them, or of the floor; for zero without one, no error."""
