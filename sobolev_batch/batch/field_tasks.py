@@ -225,7 +225,7 @@ def _store_octaves(job: Job, tail: TailSampling, surface: Surface, target: Error
     )
     samples = np.concatenate([octave.values for octave in values])
     checksum = Fields(job.store).write(job.row, (slice(0, len(samples)),), samples)
-    return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
+    return StoredBlocks(quality=Quality(surface.area, surface.extent, Probe(), quality), checksums=(checksum,))
 
 
 def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
@@ -263,7 +263,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: E
         probes.append(probe_block(surface, lattice, transform, block, result.values, draws, execution))
         backends.append(result.backend)
         points = result.points
-    facts, quality = Facts.of_surface(surface, points), Quality.from_surface(surface, join(probes))
+    facts, quality = Facts.of_surface(surface, points), Quality(surface.area, surface.extent, join(probes))
     return StoredBlocks(facts, quality=quality, checksums=tuple(checksums), backends=tuple(backends))
 
 

@@ -22,18 +22,13 @@ _FOLDS = 3.0
 _EDGE = 0.25
 
 
-def area_bound(area: float, order: float, highest: float, layers: float) -> float:
-    """Return what no squared norm beyond a frequency exceeds, with so many layers of each surface in one place.
-
-    The energy on |ξ| = r is twice the area times the layers on average, and twice that where two surfaces reinforce
-    each other. If surfaces repeat, it comes in pulses at the odd multiples of a frequency; the first may lie just
-    beyond. Besides, no value of the transform is larger than the area.
-    """
-    return float(min(factor * highest**-power for factor, power in area_bounds(area, order, layers)))
-
-
 def area_bounds(area: float, order: float, layers: float = 1.0) -> list[tuple[float, float]]:
-    """Return the bounds of `area_bound` as factors and powers: factor / frequency^power."""
+    """Return bounds on the squared norm beyond a frequency, as factors and powers: factor / frequency^power.
+
+    The energy on |ξ| = r is on average twice the area, times the layers of each surface in one place, and twice that
+    where two surfaces reinforce each other. If surfaces repeat, it comes in pulses at the odd multiples of a frequency;
+    the first may lie just beyond. Besides, no value of the transform is larger than the area.
+    """
     power = -2 * order - 3
     bounds = [(4 * layers * area * (1 - 4**order) * float(zeta(-2 * order)), -2 * order - 1)]
     if power > 0:

@@ -44,7 +44,7 @@ from sobolev_batch.norms.tail.remainder import remainder_of_flat
 from sobolev_batch.parameters import callback, check_flags, check_seed
 from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders
-from sobolev_batch.transform.spheres import sphere_inner_product, sphere_norm
+from sobolev_batch.transform.spheres import sphere_inner_product
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
@@ -99,7 +99,7 @@ def norm(
     if (accuracy := accuracy_of(rtol, memory, best_effort, seed, on_progress)) is not None:
         return to_accuracy("norm", (a,), order, lattice, accuracy, seed, on_progress)[0]
     if spheres := _spheres(a, lattice=lattice):
-        values = np.array([sphere_norm(spheres[0], s) for s in orders])
+        values = np.sqrt([sphere_inner_product(spheres[0], spheres[0], s) for s in orders])
         return labelled(order, _closed_form(values, values**2).named("norm"), {})
     field = field_of(a, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(field), orders)

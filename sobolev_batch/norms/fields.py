@@ -84,11 +84,6 @@ class Quality:
     tail: TailQuality | None = None
     beyond: Remainder | None = None
 
-    @classmethod
-    def from_surface(cls, surface: Surface, probe: Probe) -> Self:
-        """Return the quality of the field of a surface."""
-        return cls(surface.area, surface.extent, probe)
-
     def error_norms(self, weights: SobolevWeights) -> Reals:
         """Return the norm of all values' own error for each order (orders,), raised for the small samples."""
         norms = self.probe.norms(weights)
@@ -216,7 +211,8 @@ def compute_field(
     values, sample = transformed.values, sample if kind.lowest_degree <= USUAL_DEGREE else None
     draws = sample.draws if sample else draws_for([surface], lattice, orders, kind.lowest_degree, COMMON)
     probe = probe_block(surface, lattice, settings, lattice.half, values, draws, execution, sample)
-    return Field(values, transformed.points, transformed.backend, Quality.from_surface(surface, probe), settings)
+    quality = Quality(surface.area, surface.extent, probe)
+    return Field(values, transformed.points, transformed.backend, quality, settings)
 
 
 def field_for(

@@ -110,7 +110,12 @@ class NearAxes:
 
 def images_at(images: Reals, orders: Sequence[float]) -> Reals:
     """Return what images add to squared norms of any orders (orders, fields), from those of `IMAGE_ORDERS`."""
-    logarithms = np.log(np.maximum(images, np.finfo(np.float64).tiny))
-    rows = [np.interp(-np.array(orders), -np.array(IMAGE_ORDERS), row) for row in logarithms]
     # Equal surfaces have none.
-    return np.exp(np.reshape(rows, (len(images), len(orders))).T) * images.any(axis=1)
+    return by_chords(images, IMAGE_ORDERS, orders) * images.any(axis=1)
+
+
+def by_chords(values: Reals, known: Sequence[float] | Reals, orders: Sequence[float]) -> Reals:
+    """Return numbers at any orders (orders, fields), from those at known ones (fields, known), along logarithms."""
+    logarithms = np.log(np.maximum(values, np.finfo(np.float64).tiny))
+    rows = [np.interp(-np.array(orders), -np.array(known), row) for row in logarithms]
+    return np.exp(np.reshape(rows, (len(values), len(orders))).T)

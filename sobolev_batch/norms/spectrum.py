@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
-from sobolev_batch.norms.images import IMAGE_ORDERS, images_at
+from sobolev_batch.norms.images import IMAGE_ORDERS, by_chords, images_at
 from sobolev_batch.norms.tail.integrals import Scatter, deviations_by_images, error_of_sum, pooled
 from sobolev_batch.norms.tail.sampling import OctaveSampling, SampleSet, TailSampling
 from sobolev_batch.transform.lattice import Lattice, smooth_step
@@ -162,13 +162,6 @@ class _Segment:
         """1 + r² of the least |ξ| of the octave."""
         return float(1 + self.sampling.octave.lowest**2)
 
-    def peaks_at(self, peaks: Reals, orders: Sequence[float]) -> Reals:
-        """Return bounds on the largest terms (orders, fields) from peaks (fields, orders of peaks)."""
-        logarithms, falling = np.log(np.maximum(peaks, np.finfo(np.float64).tiny)), -np.array(orders)
-        chords = [np.interp(falling, -_PEAK_ORDERS, row) for row in logarithms]
-        logarithms = np.reshape(chords, (len(peaks), len(orders))).T - np.log(self.least_length) * falling[:, None]
-        return np.asarray(np.exp(logarithms))
-
     def scatter(self, sums: Reals, moments: Reals, peaks: Reals, orders: Sequence[float]) -> Scatter:
         """Return how sums over these samples vary (orders, fields), from the segment's columns of `Spectra`.
 
@@ -176,7 +169,7 @@ class _Segment:
         """
         weights, count = np.stack([self.node_lengths**order for order in orders]), self.count
         groups = np.einsum("oj,fgj->gof", weights, sums.reshape(len(sums), -1, _NODES))
-        largest = self.peaks_at(peaks, orders)
+        largest = by_chords(peaks, _PEAK_ORDERS, orders) * self.least_length ** np.array(orders)[:, None]
         if not self.sample_set.is_drawn:
             return Scatter(False, len(groups) * groups.var(axis=0, ddof=1), largest, len(groups) - 1)
         spread = np.maximum((weights**2 @ moments.T) - groups[0] ** 2 / count, 0.0)

@@ -93,7 +93,7 @@ class TransformSettings:
 
     def kind_for(self, surface: Surface, lattice: FrequencyLattice) -> SurfaceKind:
         """Return a surface with quadrature points for a lattice."""
-        return kind_of(surface).with_points(lattice.highest_frequency, self.eps, self.quadrature, self.tolerance)
+        return kind_of(surface, lattice.highest_frequency, self.eps, self.quadrature, self.tolerance)
 
 
 def thread_count(threads: int | None) -> int:

@@ -3,11 +3,11 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -41,7 +41,7 @@ _FEWEST_NODES = 500
 class SurfaceKind(ABC):
     """A surface as transforms see it: exact values anywhere, and points that stand for it up to a frequency.
 
-    `kind_of` makes it for exact values, and `with_points` for points, which are chosen when first needed.
+    `kind_of` makes it, for exact values alone or with the attributes of points, which are chosen when first needed.
 
     Attributes:
         surface: Surface in units of length.
@@ -57,12 +57,6 @@ class SurfaceKind(ABC):
     tolerance: float | None = None
     # True if the transform is a formula at every frequency.
     is_closed_form: ClassVar[bool] = False
-
-    def with_points(
-        self, highest_frequency: float, eps: float, quadrature: str | int = "auto", tolerance: float | None = None
-    ) -> Self:
-        """Return the surface with points up to a frequency; see the attributes."""
-        return replace(self, highest_frequency=highest_frequency, eps=eps, quadrature=quadrature, tolerance=tolerance)
 
     @property
     def triangles(self) -> int:
@@ -248,11 +242,11 @@ class _ClosedForm(SurfaceKind):
 _KINDS: Mapping[type, type[SurfaceKind]] = {Mesh: _Triangles, Smooth: _Parametrised, Sphere: _ClosedForm}
 
 
-def kind_of(surface: object) -> SurfaceKind:
-    """Return a surface as transforms see it; InputError where it is of no known kind."""
+def kind_of(surface: object, *of_points: Any) -> SurfaceKind:
+    """Return a surface as transforms see it, with some `of_points`; InputError where it is of no known kind."""
     for surface_type, kind in _KINDS.items():
         if isinstance(surface, surface_type):
-            return kind(surface)
+            return kind(surface, *of_points)
     raise InputError(
         "a surface must be a Mesh, a Sphere or a parametrised surface (Ellipsoid, Torus, ParametrisedSurface), "
         f"found {type(surface).__name__}"

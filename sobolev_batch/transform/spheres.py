@@ -71,11 +71,6 @@ def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
     return value
 
 
-def sphere_norm(sphere: Sphere, order: float) -> float:
-    """Return the Sobolev norm of a sphere's area measure, of an order s < -1/2."""
-    return math.sqrt(sphere_inner_product(sphere, sphere, order))
-
-
 def _matern_difference(nu: float, shorter: float, longer: float) -> float:
     """Return C(2π shorter) - C(2π longer), without cancellation if the arguments are close.
 

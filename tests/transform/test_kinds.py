@@ -107,13 +107,13 @@ def test_the_errors_that_the_package_carries_are_those_of_its_rules(row: int) ->
 @pytest.mark.parametrize("method", ["auto", "gauss8", 1, 7, 50])
 @pytest.mark.parametrize("capacity", [4_000, 20_000, 1 << 22])
 def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacity: int) -> None:
-    batches = list(kind_of(BOX).with_points(8.0, 1e-10, method).batches(capacity))
+    batches = list(kind_of(BOX, 8.0, 1e-10, method).batches(capacity))
     sizes = [len(batch.weights) for batch in batches]
     assert max(sizes) <= capacity
     # They are nearly equal, up to a batch of triangles.
     assert max(sizes) < 2 * np.mean(sizes)
     # Each batch takes an FFT: there is one where that will do.
-    assert len(list(kind_of(BOX).with_points(8.0, 1e-10, method).batches(sum(sizes)))) == 1
+    assert len(list(kind_of(BOX, 8.0, 1e-10, method).batches(sum(sizes)))) == 1
     coordinates = np.concatenate([batch.coordinates for batch in batches], axis=1)
     weights = np.concatenate([batch.weights for batch in batches])
     assert (weights > 0).all()
@@ -138,7 +138,7 @@ def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacit
 )
 def test_small_triangles_get_few_points(method: str | int, eps: float, tolerance: float | None, most: float) -> None:
     fine = icosphere(6)
-    batches = kind_of(fine).with_points(8.66, eps, method, tolerance).batches(1 << 22)
+    batches = kind_of(fine, 8.66, eps, method, tolerance).batches(1 << 22)
     assert sum(len(batch.weights) for batch in batches) / len(fine.triangles) <= most
 
 
@@ -179,8 +179,8 @@ def test_a_whole_mesh_keeps_eps_with_fewer_points_than_each_of_its_triangles(
     directions = np.concatenate([np.eye(3), [[1, 1, 0]], rng.normal(size=(16, 3))])
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     frequencies = highest * np.concatenate([directions, rng.random((10, 1)) * directions[:10]])
-    plan = kind_of(mesh).with_points(highest, eps)
-    assert plan.expected_points <= kind_of(mesh).with_points(highest, eps, "auto", eps).expected_points
+    plan = kind_of(mesh, highest, eps)
+    assert plan.expected_points <= kind_of(mesh, highest, eps, "auto", eps).expected_points
     (points,) = plan.batches(1 << 22)
     found = np.exp(-2j * np.pi * (frequencies @ points.coordinates)) @ points.weights
     assert np.abs(found - exact_transform(mesh, frequencies)).max() <= 1.2 * eps * mesh.area
@@ -194,7 +194,7 @@ def soup(mesh: Mesh) -> Mesh:
 @pytest.mark.parametrize("eps", [1e-9, 1e-6, 1e-4])
 def test_triangles_that_share_no_vertices_take_no_more_points_than_are_planned(eps: float) -> None:
     mesh = soup(icosphere(4))
-    plan, merged = (kind_of(surface).with_points(2.0, eps) for surface in (mesh, icosphere(4)))
+    plan, merged = (kind_of(surface, 2.0, eps) for surface in (mesh, icosphere(4)))
     count = sum(len(batch.weights) for batch in plan.batches(1 << 20))
     assert count == plan.expected_points == plan.largest_points
     # A rule with shared nodes would take up to twice as many of them here.
@@ -204,7 +204,7 @@ def test_triangles_that_share_no_vertices_take_no_more_points_than_are_planned(e
 @pytest.mark.parametrize("surface", [BOX, icosphere(3), Torus(1.0, 0.4)], ids=["box", "icosphere", "torus"])
 @pytest.mark.parametrize("method", ["auto", 7])
 def test_the_size_is_known_before_the_points_are_made(surface: Surface, method: str | int) -> None:
-    plan = kind_of(surface).with_points(8.66, 1e-2, method)
+    plan = kind_of(surface, 8.66, 1e-2, method)
     count = sum(len(batch.weights) for batch in plan.batches(1 << 20))
     assert plan.expected_points == pytest.approx(count, rel=0.05)
     assert count <= plan.largest_points

@@ -64,11 +64,6 @@ class _Property:
     stored: str
     length: str | None
 
-    @property
-    def least_bytes(self) -> int:
-        """The fewest bytes that it takes in a row."""
-        return struct.calcsize(self.length or self.stored)
-
 
 @dataclass(frozen=True)
 class _Element:
@@ -78,7 +73,8 @@ class _Element:
 
     def least_bytes(self, is_text: bool) -> int:
         """Return the fewest bytes that a row takes."""
-        return sum(_TEXT_BYTES if is_text else one.least_bytes for one in self.properties.values())
+        columns = self.properties.values()
+        return sum(_TEXT_BYTES if is_text else struct.calcsize(one.length or one.stored) for one in columns)
 
 
 def parse_ply(data: bytes) -> Raw:

@@ -17,7 +17,7 @@ from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import Problem, error_target
 from sobolev_batch.norms.accuracy.solve import difference_on, solve
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
-from sobolev_batch.norms.bounds import area_bound, area_bounds
+from sobolev_batch.norms.bounds import area_bounds
 from sobolev_batch.norms.budget import outer_windows
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, compute_field
@@ -267,5 +267,6 @@ def _with_beyond(problem: Problem, value: float, error: float, lattice: Lattice,
     # One layer has twice its area. The faces of a box have much of it on a few lines of a lattice.
     energy = sum(float((windows @ shell_sums(values, None, lattice, lattice.half)).max()) for values in fields)
     layers = max(energy / (2 * problem.area), 1.0)
-    highest = math.sqrt(value**2 + area_bound(problem.area, order, lattice.xi_max, layers))
+    beyond = min(factor * lattice.xi_max**-power for factor, power in area_bounds(problem.area, order, layers))
+    highest = math.sqrt(value**2 + beyond)
     return Interval.around(value, error, highest - value + error)

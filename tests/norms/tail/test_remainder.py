@@ -103,7 +103,7 @@ def test_vertices_that_no_triangle_uses_and_triangles_without_area_do_not_matter
 def test_a_remainder_survives_the_quality_of_a_field() -> None:
     beyond = remainder([BOX], [1], 60.0, ORDERS, points=100)
     for difference in (beyond, None):
-        quality = Quality.from_surface(BOX, Probe((1, 2), (0.5, 0.25)))
+        quality = Quality(BOX.area, BOX.extent, Probe((1, 2), (0.5, 0.25)))
         quality = replace(quality, tail=TailQuality((1.0,), (2.0,), beyond, difference))
         assert Quality.from_json(quality.to_json()) == quality
 
