@@ -17,8 +17,9 @@ _NAME = re.compile(r"(?:^|[._-])[lr]h\.[^.].*(?<!\.annot)(?<!\.label)(?<!\.mgh)(
 _MAGIC = b"\xff\xff\xfe"
 # The two lines after the number of the format: who made the file and when, and an empty one.
 _HEADER_LINES = re.compile(rb"[^\n]{0,1000}\n[^\n]{0,1000}\n")
-# Behind the triangles there may be the geometry of the volume, which begins with one of these.
-_VOLUME = (b"\0\0\0\x14", b"\0\0\0\2\0\0\0\0\0\0\0\x14")
+# Behind the triangles there may be the geometry of the volume, which begins with one of these. The last one says that
+# the coordinates are those of the scanner already.
+_VOLUME = (b"\0\0\0\x14", b"\0\0\0\2\0\0\0\0\0\0\0\x14", _AT_SCANNER := b"\0\0\0\2\0\0\0\1\0\0\0\x14")
 # The middle of that volume, where the coordinates of the surface have their origin, within some hundred bytes.
 _MIDDLE = re.compile(rb"valid = 1\b.*\ncras\s{0,9}=([^\n]{1,200})", re.DOTALL)
 _VOLUME_BYTES = 4096
@@ -58,7 +59,7 @@ def parse_freesurfer(data: bytes) -> Raw:
         raise MeshError(f"the file has {len(data) - end} bytes behind its {triangles} triangles")
     coordinates = np.frombuffer(data, ">f4", 3 * vertices, start)
     corners = np.frombuffer(data, ">i4", 3 * triangles, start + coordinates.nbytes)
-    middle = _MIDDLE.search(data[end : end + _VOLUME_BYTES])
+    middle = not data.startswith(_AT_SCANNER, end) and _MIDDLE.search(data[end : end + _VOLUME_BYTES])
     shift = middle[1].decode("ascii", errors="replace").split() if middle else []
     is_shifted = any(reals(shift, "c_ras"))
     notes = (f"the file has the shift c_ras = ({' '.join(shift)}) to the frame of the scanner, which is not applied",)

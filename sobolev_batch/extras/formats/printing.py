@@ -98,6 +98,8 @@ class _Package:
                     if wrong := [one for one in names if not any(word in one for word in _HARMLESS)]:
                         raise MeshError(f"it requires the 3MF extension {', '.join(wrong)}; export it without")
                 case "start", "object":
+                    if values["id"] in objects:
+                        raise MeshError(f"a part has two objects of the number {values['id'][:20]}")
                     found = objects[values["id"]] = _Object(values.get("type", "model"))
                 case "start", "vertex":
                     found.vertices.extend(reals([values[axis] for axis in "xyz"], "a vertex"))

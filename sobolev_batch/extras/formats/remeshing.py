@@ -39,7 +39,7 @@ _WITH_AREA, _WITH_VOLUME = (2, 3), (4, 5, 6, 7)
 def parse_medit(data: bytes) -> Raw:
     """Return the vertices and triangles of a Medit mesh in text."""
     # Words begin with a letter and have three or more, unlike numbers. Names stand between quotes.
-    plain = re.sub(rb'(?<!\S)#[^\n]*|"[^"\n]*"', b"", data)
+    plain = re.sub(rb'(?<!\S)#[^\r\n]*|"[^"\n]*"', b"", data)
     start, *words = re.split(rb"(?<!\S)(?!(?i:nan|inf|infinity)(?!\S))([A-Za-z][A-Za-z0-9]{2,})", plain)
     names = [word.decode("ascii") for word in words[::2]]
     sections = dict(zip(names, words[1::2], strict=True))
@@ -73,7 +73,10 @@ def parse_gmsh(data: bytes) -> Raw:
     numbered, rows = read(nodes, cells)
     if nodes.has_more() or cells.has_more():
         raise MeshError("a section has more numbers than it announces, or bytes too few")
-    faces = [corners for kind, corners in rows if kind in _WITH_AREA]
+    # The old format repeats a cell of several physical groups, with another number.
+    kept = [some[np.sort(np.unique(some, axis=0, return_index=True)[1])] for kind, some in rows if kind in _WITH_AREA]
+    faces, repeated = [some[:, 1:] for some in kept], sum(len(some) for kind, some in rows if kind in _WITH_AREA)
+    repeated -= sum(map(len, kept))
     volumes = sum(len(corners) for kind, corners in rows if kind in _WITH_VOLUME)
     # Nodes have any numbers, in any order.
     order_of_nodes = np.argsort(numbered[:, 0])
@@ -82,7 +85,9 @@ def parse_gmsh(data: bytes) -> Raw:
     for corners, place in zip(faces, places, strict=True):
         if (place == len(known)).any() or (known[place] != corners).any():
             raise MeshError("it has a face with a node that is not there")
-    return _surface(numbered[:, 1:], [order_of_nodes[place] for place in places], volumes, ".msh")
+    raw = _surface(numbered[:, 1:], [order_of_nodes[place] for place in places], volumes, ".msh")
+    note = f"{repeated:,} faces are repeated, as for several physical groups, and count once"
+    return raw._replace(notes=(*raw.notes, note)) if repeated else raw
 
 
 class _Numbers:
@@ -96,6 +101,7 @@ class _Numbers:
             raise MeshError(f"it has no section ${name.decode()} that ends")
         self.order, self.place, section = order, 0, data[start.end() : end]
         self.values: Any = section if order else np.array(_numbers(section, name.decode()))
+        self.lines = [] if order else [size for line in section.splitlines() if (size := len(line.split()))]
 
     def take(self, count: int, code: str = "u8") -> NDArray[Any]:
         """Return so many numbers more, in binary of a type of NumPy."""
@@ -128,7 +134,8 @@ class _Numbers:
         return whole(text, "a section")
 
 
-# What is read of nodes and cells: the number and the coordinates of each node (n, 4), and kinds with corners (m, k).
+# What is read of nodes and cells: the number and the coordinates of each node (n, 4), and kinds with rows (m, 1 + k) of
+# corners, behind a number that repetitions share: that of the part of the model, or that of the cell, below zero.
 _Read = tuple[Reals, list[tuple[int, NDArray[Any]]]]
 
 
@@ -137,16 +144,20 @@ def _of_second_format(nodes: _Numbers, cells: _Numbers) -> _Read:
         return _of_second_binary(nodes, cells)
     numbered = nodes.take(4 * nodes.count()).reshape(-1, 4)
     rows: dict[int, list[list[float]]] = {kind: [] for kind in _CORNERS}
-    count, numbers, place = cells.count(), cells.values.tolist(), 1
+    count, numbers, place, sizes = cells.count(), cells.values.tolist(), 1, [1]
     for _ in range(count):
         # Its number, its kind, and a count of tags, which come before its corners.
-        _, kind, tags = map(int, numbers[place : place + 3])
+        number, kind, tags = map(int, numbers[place : place + 3])
         begin, end = place + 3 + tags, place + 3 + tags + _corners(kind)
         if tags < 0 or end > len(numbers):
             raise MeshError("a section breaks off, or has wrong counts before")
-        rows[kind].append(numbers[begin:end])
+        rows[kind].append([(tags > 1 and numbers[place + 4]) or -number, *numbers[begin:end]])
+        sizes.append(end - place)
         place = end
     cells.place = place
+    # A number too many or too few would make other cells of all that follow.
+    if sizes != cells.lines:
+        raise MeshError("its cells are not the lines of $Elements: a line has a number too many or too few")
     return numbered, [(kind, np.array(found)) for kind, found in rows.items() if found]
 
 
@@ -162,7 +173,9 @@ def _of_second_binary(nodes: _Numbers, cells: _Numbers) -> _Read:
         width = 1 + tags + _corners(kind)
         if tags < 0 or not 0 < count <= left:
             raise MeshError("a section breaks off, or has wrong counts before")
-        rows[kind].append(cells.take(count * width, "i4").reshape(count, width)[:, 1 + tags :])
+        block = cells.take(count * width, "i4").reshape(count, width)
+        part = block[:, 2] if tags > 1 else np.zeros(count, np.int64)
+        rows[kind].append(np.column_stack([np.where(part, part, -block[:, 0]), block[:, 1 + tags :]]))
         left -= count
     numbered = np.column_stack([numbers.view(f"{nodes.order}i4"), places.view(f"{nodes.order}f8")])
     return numbered, [(kind, np.concatenate(found)) for kind, found in rows.items() if found]
@@ -178,7 +191,7 @@ def _of_fourth_format(nodes: _Numbers, cells: _Numbers) -> _Read:
         numbered.append(np.column_stack([numbers, nodes.take(count * width, "f8").reshape(count, width)[:, :3]]))
     for _ in range(int(cells.take(4)[0])):
         kind, count = int(cells.take(3, "i4")[2]), cells.count()
-        rows.append((kind, cells.take(count * (1 + _corners(kind))).reshape(count, -1)[:, 1:]))
+        rows.append((kind, cells.take(count * (1 + _corners(kind))).reshape(count, -1)))
     return np.concatenate(numbered), rows
 
 
@@ -215,4 +228,4 @@ def _surface(vertices: Reals, faces: Sequence[NDArray[Any]], volumes: int, suffi
     return raw._replace(notes=(*raw.notes, *beside_volume(volumes, len(sizes))))
 
 
-FORMATS = (Format((".mesh",), parse_medit, 40, 360), Format((".msh",), parse_gmsh, 48, 430))
+FORMATS = (Format((".mesh",), parse_medit, 40, 360), Format((".msh",), parse_gmsh, 48, 460))

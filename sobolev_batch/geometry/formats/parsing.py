@@ -123,6 +123,10 @@ def read_unpacked(path: Path, factor: float, read: Read = BufferedReader.read) -
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     data = data.removeprefix(codecs.BOM_UTF8)
+    if data.isascii() and b"\0" not in data:
+        # Texts of old systems end with a control-Z, and their lines with a carriage return alone.
+        data = data.removesuffix(b"\x1a")
+        data = data if b"\n" in data else data.replace(b"\r", b"\n")
     if not data:
         raise MeshError("the file is empty")
     return data

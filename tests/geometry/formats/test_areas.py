@@ -329,6 +329,11 @@ CASES |= {
     "medit, tetrahedra alone": (".mesh", medit(BOX_VERTICES, [], TETRAHEDRA), r"2 cells with volume .*scan.mesh"),
     "medit, plane": (".mesh", medit(BOX_VERTICES, BOX_QUADS).replace(b"\n3\n", b"\n2\n", 1), "not of dimension 3"),
     "medit, like no number": (".mesh", medit(BOX_VERTICES, BOX_QUADS, "Corners 1 1 Infos 1 1"), "a section 'Infos'"),
+    "medit, a comment that ends as its line does not": (
+        ".mesh",
+        replaced(medit(BOX_VERTICES, BOX_MIXED), (b"Quad", b"# more\rQuad")),
+        BOX_AREA,
+    ),
     "medit, curved": (".mesh", medit(BOX_VERTICES, BOX_QUADS, "TrianglesP2 1"), "has TrianglesP2, which are curved"),
     "medit, a face too few": (
         ".mesh",
@@ -456,6 +461,7 @@ CASES |= {
         package_3mf(model(object_3mf(BOX_VERTICES, [[0, 1, 8]]))),
         r"object 1 has an index outside 0\.\.7",
     ),
+    "3mf, a number of two objects": (".3mf", package_3mf(model(BOX_3MF * 2)), "two objects of the number 1"),
     "3mf, no archive": (".3mf", b"PK", "no whole zip archive"),
     "lightwave": (".lwo", b"FORM", "format LightWave.*assimp export scan.lwo scan.ply"),
     "draco": (".drc", b"DRACO", "format Draco.*draco_decoder -i scan.drc -o scan.ply"),
@@ -470,6 +476,21 @@ CASES |= {
     "a zip archive": (".obj.zip", archive({"scan.obj": OBJ_BOX}), "format zip.*unzip scan.zip"),
     "an archive of tar": (".tar.gz", gzip.compress(bytes(10240)), "format tar.*tar -xf scan.tar"),
     "a collection": (".vtm", b"<VTKFile/>", r"VTK collection.*read\('scan.vtm'\).combine\(\).extract"),
+}
+
+# The ends of lines and of texts on old systems.
+CASES |= {
+    f"{ending}, {what}": (ending, content.rstrip().replace(b"\n", end) + last, BOX_AREA)
+    for ending, content in {
+        ".obj": b"# a box\n" + OBJ_BOX,
+        ".off": OFF_BOX,
+        ".stl": STL_TEXT,
+        ".ply": PLY_BOX,
+        ".vtk": vtk_legacy(BOX_VERTICES, BOX_QUADS),
+        ".mesh": replaced(medit(BOX_VERTICES, BOX_MIXED), (b"Quad", b"# more\nQuad")),
+        ".msh": gmsh_first(BOX_VERTICES, BOX_MIXED),
+    }.items()
+    for what, end, last in (("carriage returns", b"\r", b"\r"), ("control-Z", b"\n", b"\n\x1a"))
 }
 
 # What stands before texts, and means nothing; and what Windows calls no number, where it is not used.
@@ -568,7 +589,15 @@ CASES |= {
     "gmsh, a corner twice": (
         ".msh",
         re.sub(rb"(\d+)(\n\$EndElements)", rb"\1 \1\2", gmsh_first(BOX_VERTICES, BOX_MIXED)),
-        "more numbers than it announces",
+        "a line has a number too many or too few",
+    ),
+    # As a stream, the next triangle becomes a line, and all numbers are used up.
+    "gmsh, a number lost": (
+        ".msh",
+        replaced(
+            gmsh_first(BOX_VERTICES, BOX_TRIANGLES), (b" 3 0 1 2 ", b" 2 1 1 "), (b" 1 1 10 20 40", b" 1 1 10 20")
+        ),
+        "a line has a number too many or too few",
     ),
     "gmsh, a byte lost": (
         ".msh",
@@ -650,6 +679,11 @@ NOTED: dict[str, tuple[str, bytes, str]] = {
         "the file has the shift c_ras = (5.5 -18.0 1e1) to",
     ),
     "freesurfer, at the scanner": ("_lh.pial", frame_of_volume("cras   = 0 0.0 -0\n"), ""),
+    "freesurfer, in the scanner's frame": (
+        "_lh.pial",
+        replaced(frame_of_volume("cras   = 5.5 -18.0 1e1\n"), (b"\0\0\0\2\0\0\0\0", b"\0\0\0\2\0\0\0\1")),
+        "",
+    ),
     "freesurfer, no valid volume": ("_lh.pial", frame_of_volume("cras   = 5 1 1\n", 0), ""),
     "gifti, moved": (".gii", GIFTI_BOX.replace(b"1.000000   0.000000", b"1.000000   0.5", 1), MOVED),
     "gifti, matrix of four numbers": (
@@ -669,6 +703,18 @@ NOTED: dict[str, tuple[str, bytes, str]] = {
         medit(BOX_VERTICES, BOX_QUADS, TETRAHEDRA),
         "2 cells with volume are left out beside 6 faces",
     ),
+    **{
+        f"gmsh, a face of two groups in the form {write.__name__}": (
+            ".msh",
+            write(BOX_VERTICES, [*BOX_MIXED, BOX_MIXED[0]]).replace(*without),
+            "1 faces are repeated, as for several physical groups",
+        )
+        # The tetrahedra of the binary form become points.
+        for write, without in (
+            (gmsh_first, (b"", b"")),
+            (gmsh_first_binary, (struct.pack("<3i", 4, 1, 0), struct.pack("<3i", 15, 1, 3))),
+        )
+    },
     "3mf, in inches": (".3mf", package_3mf(model(BOX_3MF, attributes='unit="inch"')), "its unit of length is the inch"),
     **{
         f"3mf, a {kind} of {program}": (
