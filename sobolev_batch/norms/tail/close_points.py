@@ -129,6 +129,12 @@ class Sheets:
         """Area of all surfaces together."""
         return sum(mesh.area for mesh, _ in self.meshes) + sum(sphere.area for sphere, _ in self.spheres)
 
+    @property
+    def reach(self) -> float:
+        """Largest |coordinate|."""
+        reaches = [mesh.extent.reach for mesh, _ in self.meshes]
+        return max(*reaches, *(sphere.extent.reach for sphere, _ in self.spheres), 0.0)
+
     def triangles(self) -> Iterator[SignedTriangles]:
         """Yield the triangles of the meshes: all at once, and once for all, where they are not many."""
         if self._few is not None:

@@ -11,6 +11,7 @@ foot. With q sinh t for the distance along the edge, dθ is dt/cosh t. K and M f
 they are cut; twice the reach and twice the nodes tell what that changes.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -33,9 +34,10 @@ from sobolev_batch.transform.rules import symmetric_rule
 # Processor time of a pair of a point and a triangle, and of each of its orders, in seconds: on arrays, and compiled,
 # with a share of the time that loops take to load.
 _ON_ARRAYS, _COMPILED, _START = (1e-6, 4e-7), (5e-7, 5e-8), 0.15
-# Distances in wavelengths 1/X between which kernels are tabulated. The smaller one is rounding. Beyond the larger one,
-# which depends on the order, they are below 1 % of what they are at zero, and between these fractions of it they fade.
-_LEAST, _FADE = 1e-12, (0.75, 0.999)
+# Distances in wavelengths 1/X between which kernels are tabulated. The smaller one is rounding, or that of coordinates,
+# as a part of the largest one: of points on their own face, 3e-16 of it was seen. Beyond the larger one, which depends
+# on the order, they are below 1 % of what they are at zero, and between these fractions of it they fade.
+_LEAST, _OF_COORDINATES, _FADE = 1e-12, 4e-15, (0.75, 0.999)
 _REACHES = (-4.0, -3.0, -2.0, -1.0), (12.0, 10.0, 8.0, 6.0)
 # Entries of a table up to the reach, how many times as many are interpolated, and where equal steps begin.
 _ENTRIES, _DENSER, _LINEAR_FROM = 1500, 8, 0.3
@@ -92,6 +94,7 @@ class Kernels:
     Attributes:
         cutoff: |ξ| at which the step ends, in cycles per unit length.
         fineness: 1, or how many times as far the kernels reach, and as many nodes serve.
+        least: Distance in wavelengths up to which all are none.
         reach: Distance beyond which all kernels are zero.
         start: Where the tables begin, and the step between their entries.
         totals: M(0), (orders,).
@@ -102,6 +105,7 @@ class Kernels:
     cutoff: float
     orders: tuple[float, ...]
     fineness: int
+    least: float
     reach: float
     start: float
     step: float
@@ -110,13 +114,17 @@ class Kernels:
     values: Reals
 
     @classmethod
-    def of_orders(cls, cutoff: float, orders: Sequence[float], fineness: int = 1) -> Self:
-        """Return the kernels of some orders."""
-        start, end = _grid(cutoff, fineness)
-        tables = zip(*(_tables(cutoff, order, fineness) for order in orders), strict=True)
+    def of_orders(
+        cls, cutoff: float, orders: Sequence[float], fineness: int = 1, largest_coordinate: float = 0.0
+    ) -> Self:
+        """Return the kernels of some orders, for surfaces with coordinates up to a largest one."""
+        # Of a few sizes, so that meshes of a study share their tables.
+        least = max(_LEAST, 2.0 ** math.ceil(math.log2(max(_OF_COORDINATES * largest_coordinate * cutoff, _LEAST))))
+        start, end = _grid(cutoff, fineness, least)
+        tables = zip(*(_tables(cutoff, order, fineness, least) for order in orders), strict=True)
         totals, drops, values = (np.stack(rows, axis=-1) for rows in tables)
         reach, step = fineness * max(map(reach_of, orders)) / cutoff, (end - start) / (len(drops) - 1)
-        return cls(cutoff, tuple(orders), fineness, reach, start, step, totals, drops, values)
+        return cls(cutoff, tuple(orders), fineness, least, reach, start, step, totals, drops, values)
 
     def looked_up(self, table: Array, squares: Array) -> Array:
         """Return a table's values at each d², (..., orders), by quadratic splines.
@@ -124,7 +132,7 @@ class Kernels:
         A face has one height above a parallel one. Straight lines would lose second differences, which a distance is
         made of, of moves by less than a step of the table.
         """
-        squares = np.minimum(np.maximum(squares, (_LEAST / self.cutoff) ** 2), self.reach**2)
+        squares = np.minimum(np.maximum(squares, (self.least / self.cutoff) ** 2), self.reach**2)
         places = np.minimum((_scale(np.sqrt(squares), self.cutoff) - self.start) / self.step, len(table) - 1.5001)
         entries = np.where(places > 1, places + 0.5, 1.0).astype(np.int64)  # NaN stays what it is
         offsets, middle = np.maximum(places, 0.0) - entries, table[entries]
@@ -153,16 +161,16 @@ def _distances(scale: Reals, cutoff: float) -> Reals:
     return np.asarray(np.where(scale < 0, np.exp(np.minimum(scale, 0)), scale + 1) * _LINEAR_FROM / cutoff)
 
 
-def _grid(cutoff: float, fineness: int) -> tuple[float, float]:
+def _grid(cutoff: float, fineness: int, least: float) -> tuple[float, float]:
     """Return where tables begin and end, the same for all orders."""
-    ends = _scale(np.array([_LEAST, fineness * max(_REACHES[1])]) / cutoff, cutoff).tolist()
+    ends = _scale(np.array([least, fineness * max(_REACHES[1])]) / cutoff, cutoff).tolist()
     return ends[0], ends[1]
 
 
 @lru_cache(maxsize=1024)
-def _tables(cutoff: float, order: float, fineness: int) -> tuple[float, Reals, Reals]:
+def _tables(cutoff: float, order: float, fineness: int, least: float) -> tuple[float, Reals, Reals]:
     """Return M(0), the table of M(0) - M(d) and that of K(d) for an order."""
-    (start, end), count = _grid(cutoff, fineness), fineness * _ENTRIES
+    (start, end), count = _grid(cutoff, fineness, least), fineness * _ENTRIES
     reach, total = fineness * reach_of(order) / cutoff, tail_integral(cutoff, order)
     distances = _distances(np.linspace(start, end, count), cutoff)
     drops = np.zeros(count)
@@ -310,7 +318,7 @@ def add_compiled(
     ends = np.cumsum([0, *(len(rule.weights) for rule in rules)])
     tables = (
         *(kernels.cutoff, kernels.reach, kernels.start, kernels.step),
-        *(kernels.totals, kernels.drops, kernels.values, _LEAST, _LINEAR_FROM),
+        *(kernels.totals, kernels.drops, kernels.values, kernels.least, _LINEAR_FROM),
     )
     longest = _PANEL / kernels.fineness, _PANEL_WAVES / kernels.fineness / kernels.cutoff
     panels = *longest, _LAST, np.stack(_PANEL_NODES)
@@ -395,7 +403,7 @@ def _square_on_longest(normals: Array, edges: Array) -> Array:
 def _of_span(offsets: Array, heights: Array, near: Array, far: Array, *, kernels: Kernels) -> Array:
     """Return ∫ [M(h) - M(√(h² + q²/cos²θ))] dθ between two distances from the foot on an edge's line, (n, orders)."""
     reach, squares = kernels.reach, heights * heights
-    q = np.maximum(np.abs(offsets), _LEAST * reach)
+    q = np.maximum(np.abs(offsets), kernels.least * reach)
     # Beyond the reach the integrand is constant.
     farthest = np.sqrt(np.maximum(reach**2 - squares - q * q, 0.0))
     begin, end = np.minimum(near, farthest), np.minimum(far, farthest)

@@ -185,7 +185,8 @@ def remainder(
     lowest = LOWEST_ORDER * (1 + cutoff**-2)
     known = tuple(sorted({max(order, lowest) for order in orders or _USUAL_ORDERS}, reverse=True))
     sheets = Sheets.from_surfaces(surfaces, signs, cutoff)
-    seen_by, rng = _Seen(sheets, Kernels.of_orders(cutoff, known), execution), np.random.default_rng(seed)
+    kernels = Kernels.of_orders(cutoff, known, largest_coordinate=sheets.reach)
+    seen_by, rng = _Seen(sheets, kernels, execution), np.random.default_rng(seed)
     if points is not None or is_scale:
         return _estimate(seen_by, points or _FEW_POINTS, rng, is_exact=not is_scale)
     affordable = seen_by.affordable(rng)
@@ -384,7 +385,7 @@ class _Seen:
         """
         count = min(_CONTROLS, n := draw.weights.shape[1])
         chosen = np.sort(rng.choice(n, count, replace=False))
-        kernels = Kernels.of_orders(self.kernels.cutoff, self.kernels.orders, fineness=2)
+        kernels = Kernels.of_orders(self.kernels.cutoff, self.kernels.orders, 2, self.sheets.reach)
         finer = _Seen(self.sheets, kernels, self.execution)
         changes = finer.potentials(draw.points[:, chosen].reshape(-1, 3))[0]
         changes = changes.reshape(-1, count, changes.shape[1]) - potentials[:, chosen]

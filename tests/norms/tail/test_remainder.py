@@ -32,6 +32,14 @@ def test_energies_of_one_surface_are_twice_its_area() -> None:
         assert np.allclose(beyond.energies, 2 * surface.area, rtol=0.02), surface
 
 
+@pytest.mark.parametrize("cutoff", [1e5, 1e8])
+def test_rounding_takes_no_point_off_its_face(cutoff: float) -> None:
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    for surface in (Mesh(BOX.vertices @ turn, BOX.triangles), Sphere(0.7, (0.1, 0.2, 0.3))):
+        energies = remainder([surface], [1], cutoff, ORDERS, points=64).energies
+        assert np.allclose(energies, 2 * surface.area, rtol=1e-4), surface
+
+
 def test_facets_lack_no_area_of_a_smooth_surface() -> None:
     radius, cutoff, orders = 4.0, 1.5, (-1.0, -2.0)
     # ∫ (1 - step) (1 + r²)^s |σ^|² dr for a sphere; beyond the last node the sine is averaged out.
