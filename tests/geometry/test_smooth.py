@@ -127,5 +127,5 @@ def test_derivatives_of_resolved_functions_are_exact_to_rounding(periodic: bool,
     [(1, 1), (2, 1), (math.nan, 1), (0, math.inf), ("0", 1.0), (False, True), (-1e308, 1e308), (0.0, 1.0, 1)],
 )
 def test_an_interval_has_two_ends(arguments: tuple[Any, ...]) -> None:
-    with pytest.raises(InputError, match="an interval|periodic must be True or False"):
+    with pytest.raises(InputError, match=r"an interval|periodic must be True or False"):
         Interval(*arguments)
