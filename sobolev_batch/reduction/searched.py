@@ -120,12 +120,11 @@ class SearchedMember(Member):
 
     def pilot(self) -> Surface:
         """Return the mesh that is found, or the one that a search would try next where none may run."""
-        search = self.search
-        record = search.recorded() or search.begun()
-        if self.may_search or not (sizes := search.next(record)):
-            return self.load()
-        _, member, *_ = search.trial(record, sizes[0])
-        return member.load()
+        if not self.may_search:
+            record = self.search.recorded() or self.search.begun()
+            if sizes := self.search.next(record):
+                return self.search.trial(record, sizes[0])[1].load()
+        return self.load()
 
     def cost(self) -> Cost | None:
         """Return what all trials took, as far as that is known."""
