@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import pandas as pd
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from sobolev_batch.errors import MeshError, StudyError, one_line, refused_by_pydantic
 from sobolev_batch.geometry.formats.conversion import as_mesh
@@ -200,7 +200,16 @@ class FunctionSource(RemesherSource):
     """
 
     function: Callable[..., Any] | str
-    version: str | None = None
+    version: str | None = Field(default=None, validate_default=True)
+
+    @field_validator("version")
+    @classmethod
+    def _at_hand(cls, version: str | None, info: ValidationInfo) -> str | None:
+        # Workers get a function of a script or a notebook without its source.
+        if version is not None or not callable(function := info.data.get("function")):
+            return version
+        with refused_by_pydantic():
+            return function_version(function)
 
     def _remesher(self, parameters: dict[str, Parameter], folder: Path) -> Remesher:
         make = partial(call_function, function=self.function, parameters=parameters)

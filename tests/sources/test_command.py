@@ -53,6 +53,22 @@ def test_lists_are_swept_and_every_value_is_known(tmp_path: Path) -> None:
         made({**HALVED, "a": list(range(100)), "b": list(range(100))}, tmp_path)
 
 
+def test_the_version_of_a_function_is_known_where_its_source_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    # As on workers, which have the functions of a script or a notebook without the file.
+    table = {"source": "function", "function": halved, "mesh": BALL}
+    source = parse_source(table)
+    (before,) = source.members(Path())
+
+    def lost(function: object) -> str:
+        raise OSError("could not get source code")
+
+    monkeypatch.setattr("inspect.getsource", lost)
+    (after,) = pickle.loads(pickle.dumps(source)).members(Path())
+    assert after.fingerprint() == before.fingerprint()
+    with pytest.raises(ValueError, match=r'source of .*halved is not at hand; give "version"'):
+        parse_source(table)
+
+
 @pytest.mark.parametrize(
     ("change", "refusal"),
     [
