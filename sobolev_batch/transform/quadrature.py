@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Array, Indices, Reals, slices
+from sobolev_batch.arrays import Array, Reals, slices
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.backends import CPU, Backend, combine, sums_at, sums_of_runs
 from sobolev_batch.transform.faces import FaceArrays
@@ -93,20 +93,11 @@ def assign_rules(
     tolerance = tolerance_for(mesh, highest_frequency, eps, faces, backend) if tolerance is None else tolerance
     rules, ranges = rule_ranges(tolerance, shares_vertices(mesh))
     sizes = mesh.centroid_radii
-    factor, keys = 2 * np.pi * highest_frequency, np.empty(len(sizes), dtype=np.uint16)
-
-    # A key is splits times the number of rules plus that of the rule.
-    def numbers(some: Reals) -> Indices:
-        splits, choice = choose_rules(factor * some, ranges)
-        return splits * len(ranges) + choice
-
-    # Larger triangles have as many splits or more, and with as many the same rule or a later one.
-    low, high = numbers(np.array([sizes.min(), sizes.max()])).tolist()
-    if low == high:
-        return (RuleUse(rules[low % len(rules)], low // len(rules), np.arange(len(sizes), dtype=np.uint32)),)
+    keys = np.empty(len(sizes), dtype=np.uint16)
     # Meshes have tens of millions of triangles: temporaries are small, and four bytes for each are kept.
     for part in slices(len(sizes), _TRIANGLES):
-        keys[part] = numbers(sizes[part])
+        splits, choice = choose_rules(2 * np.pi * highest_frequency * sizes[part], ranges)
+        keys[part] = splits * len(rules) + choice
     return tuple(
         RuleUse(rules[key % len(rules)], key // len(rules), np.flatnonzero(keys == key).astype(np.uint32))
         for key in np.flatnonzero(np.bincount(keys)).tolist()

@@ -88,8 +88,6 @@ def size_classes(mesh: Mesh, faces: FaceArrays | None = None) -> Reals:
     count = max(1, min(_BINS, math.ceil(8 * math.log(largest / smallest))))
     edges = np.geomspace(smallest, largest, count + 1)
     radii, areas, backend = mesh.centroid_radii, mesh.areas, CPU
-    if count == 1:
-        return np.array([[edges[0]], [edges[1]], [areas.sum()], [np.square(areas).sum()]])
     if faces is not None:
         radii, areas, backend = faces.radii, faces.areas, faces.backend
     classes = np.searchsorted(np.asarray(edges[1:-1], like=radii), radii)

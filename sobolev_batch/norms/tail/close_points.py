@@ -53,12 +53,6 @@ class Moved:
         """Area of each triangle, of both meshes together (m,)."""
         return np.asarray(sum(mesh.areas for mesh, _ in self.meshes))
 
-    @property
-    def squared_moves(self) -> Reals:
-        """Largest squared move of a corner of each triangle (m,)."""
-        (one, _), (other, _) = self.meshes
-        return np.asarray(((one.vertices - other.vertices) ** 2).sum(axis=1)[one.triangles].max(axis=1))
-
     def in_proportion(self, densities: Reals, count: int, rng: np.random.Generator) -> tuple[Draw, Reals, Indices]:
         """Draw pairs in proportion to densities (m,), most of them, and evenly by area for the others.
 
@@ -136,20 +130,10 @@ class Sheets:
         return max(*reaches, *(sphere.extent.reach for sphere, _ in self.spheres), 0.0)
 
     def triangles(self) -> Iterator[SignedTriangles]:
-        """Yield the triangles of the meshes: all at once, and once for all, where they are not many."""
-        if self._few is not None:
-            yield self._few
-            return
+        """Yield the triangles of the meshes, not too many at a time."""
         for mesh, sign in self.meshes:
             for part in slices(len(mesh.triangles), _HELD):
                 yield SignedTriangles.with_area(mesh.vertices[mesh.triangles[part]], sign)
-
-    @cached_property
-    def _few(self) -> SignedTriangles | None:
-        if not 0 < sum(len(mesh.triangles) for mesh, _ in self.meshes) <= _HELD:
-            return None
-        several = [SignedTriangles.with_area(mesh.vertices[mesh.triangles], sign) for mesh, sign in self.meshes]
-        return SignedTriangles.joined(several)
 
     @cached_property
     def _parts(self) -> list[Mesh | Sphere]:

@@ -56,11 +56,6 @@ class OctaveWeights:
         lengths, weights = 1 + self.sampling.radii**2, self.sampling.weights
         return np.stack([*(weights * lengths**order for order in self.orders), weights])
 
-    @cached_property
-    def width(self) -> float:
-        """Integral of the octave's window over |ξ|."""
-        return self.sampling.octave.integral(0.0)
-
     def sums(self, squares: Reals) -> OctaveSums:
         """Return the integrals of |field|², or of products of two fields, with variances, from all samples (n,)."""
         sums, scatters = np.zeros(len(self.by_order)), []
@@ -77,8 +72,8 @@ class OctaveWeights:
             scatters.append(Scatter(sample_set.is_drawn, count * groups.var(axis=1, ddof=1), unseen, count - 1))
         by_origin, degrees = pooled(scatters)
         # The weights of the last row are those of the energy.
-        deviation = float(np.sqrt(by_origin[:, -1].sum())) / self.width
-        return OctaveSums(sums[:-1], by_origin[:, :-1], degrees, float(sums[-1]) / self.width, deviation)
+        width, deviation = self.sampling.octave.integral(0.0), float(np.sqrt(by_origin[:, -1].sum()))
+        return OctaveSums(sums[:-1], by_origin[:, :-1], degrees, float(sums[-1]) / width, deviation / width)
 
 
 def deviations_by_images(

@@ -233,11 +233,6 @@ class SignedTriangles:
         corners = corners[doubled > 0]
         return cls(corners, np.full(len(corners), float(sign)))
 
-    @classmethod
-    def joined(cls, several: Sequence[Self]) -> Self:
-        """Return all triangles of several."""
-        return cls(*(np.concatenate([getattr(one, name) for one in several]) for name in ("corners", "signs")))
-
     @cached_property
     def balls(self) -> tuple[Reals, Reals]:
         """See `centers_and_radii`."""

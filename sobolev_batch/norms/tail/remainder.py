@@ -361,7 +361,9 @@ class _Seen:
         """Meshes of the same triangles that are a little moved, and the parts of `alone` that a plane so far has."""
         if (moved := self.sheets.moved) is None:
             return None
-        shares = self.kernels.looked_up(self.kernels.drops, moved.squared_moves) / self.kernels.totals
+        (one, _), (other, _) = moved.meshes
+        squares = ((one.vertices - other.vertices) ** 2).sum(axis=1)[one.triangles].max(axis=1)
+        shares = self.kernels.looked_up(self.kernels.drops, squares) / self.kernels.totals
         means = moved.areas @ shares / moved.areas.sum()
         return (moved, shares) if np.all((means > 0) & (means < _LITTLE)) else None
 
