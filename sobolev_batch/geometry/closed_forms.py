@@ -103,8 +103,7 @@ class Ellipsoid(Smooth):
                 f"an ellipsoid's semi-axes must be three numbers between {shortest:g} and {LARGEST_LENGTH:g}, "
                 f"found {self.axes}"
             )
-        center = checked_point(self.center, "an ellipsoid's center")
-        vars(self).update(axes=axes, center=center)
+        vars(self).update(axes=axes, center=checked_point(self.center, "an ellipsoid's center"))
 
     @property
     def intervals(self) -> tuple[Interval, Interval]:

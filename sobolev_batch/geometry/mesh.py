@@ -72,7 +72,7 @@ class Mesh:
     notes: tuple[str, ...] = ()
 
     def __init__(self, vertices: ArrayLike, triangles: ArrayLike, notes: tuple[str, ...] = ()) -> None:
-        checked, notes = _checked_vertices(vertices), tuple(as_names(notes))
+        checked, notes = checked_points(vertices, "vertices"), tuple(as_names(notes))
         vars(self).update(vertices=checked, triangles=_checked_triangles(triangles, len(checked)), notes=notes)
         self._require_sizes()
 
@@ -441,16 +441,17 @@ def _array(values: ArrayLike, name: str) -> NDArray[Any]:
         raise MeshError(f"{name} must be an array of rows of three, found rows of different lengths") from error
 
 
-def _checked_vertices(vertices: ArrayLike) -> Reals:
-    array = _array(vertices, "vertices")
+def checked_points(points: ArrayLike, name: str = "points") -> Reals:
+    """Return points as read-only float64 (n, 3); MeshError, with their name, where they are not real and finite."""
+    array = _array(points, name)
     if array.dtype.kind not in "fiu":
-        raise MeshError(f"vertices must be real numbers, found dtype {array.dtype}")
+        raise MeshError(f"{name} must be real numbers, found dtype {array.dtype}")
     if array.ndim != 2 or array.shape[1] != 3:
-        raise MeshError(f"vertices must have shape (n, 3), found {array.shape}")
+        raise MeshError(f"{name} must have shape (n, 3), found {array.shape}")
     with np.errstate(over="ignore"):
         converted = _owned(array, np.float64)
     if (bad := np.flatnonzero(~np.isfinite(converted).all(axis=1))).size:
-        raise MeshError(f"{bad.size} of {len(array)} vertices have NaN or infinite coordinates: {_listed(bad, array)}")
+        raise MeshError(f"{bad.size} of {len(array)} {name} have NaN or infinite coordinates: {_listed(bad, array)}")
     return _frozen(converted)
 
 

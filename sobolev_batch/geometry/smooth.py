@@ -135,8 +135,7 @@ class Smooth(ABC):
         (u, along_u), (v, along_v) = rules
         whole = self._on_grid(u, v) if self.tangents(u[:1], v[:1]) is None else None
         for batch in slices(counts[0], max(1, most // counts[1])):
-            parts = self._on_grid(u[batch], v) if whole is None else tuple(values[:, batch] for values in whole)
-            positions, *tangents = parts
+            positions, *tangents = self._on_grid(u[batch], v) if whole is None else (one[:, batch] for one in whole)
             weights = cross_lengths(*tangents)
             weights *= along_u[batch, None]
             weights *= along_v

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.mesh import checked_points
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.columns import (
@@ -213,7 +214,7 @@ def witness(
     """
     orders = check_orders(order)
     settings = TransformSettings(eps, dtype)
-    coordinates = _coordinates(points)
+    coordinates = np.ascontiguousarray(checked_points(points).T)
     first, second = pair_of(a, b, lattice, orders)
     lattice = Lattice.from_field(first)
     require_points_inside(coordinates, lattice)
@@ -244,16 +245,3 @@ def witness(
             "shortest_wavelength": 1 / lattice.xi_max,
         },
     )
-
-
-def _coordinates(points: ArrayLike) -> Reals:
-    """Return points (n, 3) as one contiguous row per axis (3, n); InputError where they are not real and finite."""
-    try:
-        array = np.asarray(points, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"points must be real numbers (n, 3): {error}") from error
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"points must have the shape (n, 3), found {array.shape}")
-    if bad := int(np.count_nonzero(~np.isfinite(array).all(axis=1))):
-        raise InputError(f"{bad} of {len(array)} points have NaN or infinite coordinates")
-    return np.ascontiguousarray(array.T)

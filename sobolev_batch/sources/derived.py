@@ -267,7 +267,6 @@ def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
     in units of length.
     """
     places, place_of_vertex = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    place_of_vertex = place_of_vertex.reshape(-1)
     directions = _vertex_normals(places, place_of_vertex[mesh.triangles])
     sizes = amplitude * np.random.default_rng(seed).standard_normal(len(places))
     return Mesh((places + sizes[:, None] * directions)[place_of_vertex], mesh.triangles)

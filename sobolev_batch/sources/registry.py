@@ -7,7 +7,6 @@ through the entry point group ``sobolev_batch.sources``; each entry point names 
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 from abc import ABC, abstractmethod
@@ -15,18 +14,18 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from importlib.metadata import EntryPoint, PackageNotFoundError, version
+from importlib.metadata import EntryPoint, version
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, SerializeAsAny
 
-from sobolev_batch.errors import MeshError, StudyError
+from sobolev_batch.errors import MeshError, StudyError, from_extra
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface, is_finite_number
 from sobolev_batch.plugins import SOURCES, registered
 from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
-from sobolev_batch.sources.names import quoted
+from sobolev_batch.sources.names import known_names, quoted
 from sobolev_batch.sources.programs import Cost
 
 # Levels, or triangle counts of one mesh, that one source takes; and times.
@@ -399,9 +398,8 @@ def source_type_of(name: object) -> type[Source]:
     """Return the source of a name; StudyError where there is none, or it cannot be loaded."""
     registry = sources_by_name()
     if not isinstance(name, str) or name not in registry:
-        message = f"no source is named {quoted(name)}; known are {', '.join(sorted(registry))}"
-        similar = difflib.get_close_matches(name[:100].lower(), registry, n=1) if isinstance(name, str) else []
-        raise StudyError(f"{message}; did you mean {similar[0]!r}?" if similar else message)
+        hint = known_names(name if isinstance(name, str) else "", sorted(registry))
+        raise StudyError(f"no source is named {quoted(name)}; {hint}")
     try:
         source_type = registry[name].load()
     except (ImportError, AttributeError) as error:
@@ -430,13 +428,8 @@ def load_mesh(member: Member) -> Mesh:
 
 def installed_version(distribution: str) -> str:
     """Return the version of a library whose output is part of a surface; MeshError where it is not installed."""
-    try:
+    with from_extra("studies", "this source needs", MeshError):
         return version(distribution)
-    except PackageNotFoundError as error:
-        raise MeshError(
-            f"this source needs the library {distribution}, which is not installed; install the extra: "
-            "pip install 'sobolev-batch[studies]'"
-        ) from error
 
 
 @lru_cache(maxsize=1)
