@@ -245,7 +245,7 @@ def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> Stor
         field = field_for(surface, lattice, target, transform, execution)
     else:
         field = compute_field(surface, lattice, transform, job.orders, execution)
-    checksum = Fields(job.store).write(job.row, lattice.place(lattice.half), field.values)
+    checksum = Fields(job.store).write(job.row, lattice.half.place_in(lattice.half), field.values)
     facts = Facts.of_surface(surface, field.points)
     return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
 
@@ -259,7 +259,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: E
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
         result = transform_block(surface, lattice, block, transform, execution, kind)
-        checksums.append(Fields(job.store).write(job.row, lattice.place(block), result.values))
+        checksums.append(Fields(job.store).write(job.row, block.place_in(lattice.half), result.values))
         probes.append(probe_block(surface, lattice, transform, block, result.values, draws, execution))
         backends.append(result.backend)
         points = result.points

@@ -312,8 +312,8 @@ def read_blocks(
     lattice: Lattice, *fields: xr.DataArray, largest: int = BLOCK_SAMPLES
 ) -> Iterator[tuple[Block, list[Complexes]]]:
     """Read fields block by block of their half lattice, so that they need not fit into memory."""
-    for block in lattice.split(largest):
-        places = dict(zip(AXES, lattice.place(block), strict=True))
+    for block in lattice.half.split(largest):
+        places = dict(zip(AXES, block.place_in(lattice.half), strict=True))
         yield block, [np.asarray(field.isel(places).transpose(*AXES).values) for field in fields]
 
 

@@ -86,7 +86,7 @@ class Plan:
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
         """Blocks of the lattice, one chunk of the store each."""
-        return self.lattice.split(self.study.largest_chunk_bytes // self.item_bytes)
+        return self.lattice.half.split(self.study.largest_chunk_bytes // self.item_bytes)
 
     @property
     def item_bytes(self) -> int:

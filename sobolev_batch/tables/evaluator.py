@@ -372,7 +372,7 @@ class Evaluator:
     def read(self, rows: Sequence[int], number: int) -> Complexes:
         """Read one block of fields, and check it against their records."""
         expected = [self.checksums[row][number] for row in rows]
-        return Fields(self.store).read(rows, self.lattice.place(self.blocks[number]), expected)
+        return Fields(self.store).read(rows, self.blocks[number].place_in(self.lattice.half), expected)
 
     def read_octaves(self, row: int) -> Complexes:
         """Return the values of a row at all samples of octaves (n,), and check them against its record."""

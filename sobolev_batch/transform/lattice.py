@@ -138,14 +138,6 @@ class FrequencyLattice:
         along = np.stack([axis.ravel() for axis in np.meshgrid(*self.frequencies(block), indexing="ij")])
         return np.asarray((along if self.rotation is None else np.einsum("kq,kn->qn", self.rotation, along)).T)
 
-    def split(self, largest_size: int) -> tuple[Block, ...]:
-        """Return equal blocks that make up the lattice: see `Block.split`."""
-        return self.half.split(largest_size)
-
-    def place(self, block: Block) -> tuple[slice, slice, slice]:
-        """Return the slices of a block in an array of the whole lattice."""
-        return block.place_in(self.half)
-
 
 @dataclass(frozen=True)
 class Lattice(FrequencyLattice):

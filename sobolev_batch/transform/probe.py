@@ -53,10 +53,6 @@ class Draws:
     count: int
     seed: int
 
-    def places(self, block: Block) -> tuple[Indices, ...]:
-        """Return the array indices of the draws in a block that holds them all."""
-        return tuple((self.indices - block.start).T)
-
     def inside(self, block: Block) -> NDArray[np.bool_]:
         """Return which draws fall into a block (P,)."""
         offsets = self.indices - block.start
@@ -255,7 +251,7 @@ def probe_block(
         further = pooled.frequencies[np.count_nonzero(common) :]
         own = kind_of(surface).sampled_values(further, execution.threads, execution.backend)
         exact = np.concatenate([sample.exact[common], own])
-    probe = measure(pooled, values[pooled.places(block)], exact)
+    probe = measure(pooled, values[tuple((pooled.indices - block.start).T)], exact)
     change = settings.kind_for(surface, lattice).change
     if change and block.start == lattice.half.start:
         return join([probe, uniform_probe(lattice, change * surface.area)])

@@ -63,7 +63,7 @@ def test_a_mesh_is_one_task_whatever_the_memory_allows(store_path: Path) -> None
     # Batches of triangles share no nodes with each other.
     assert whole.facts.points <= record.facts.points < 1.1 * whole.facts.points
     assert replace(record.facts, points=whole.facts.points) == whole.facts
-    expected, values = Fields(job.store).read([0, 1], plan.lattice.place(plan.lattice.half))
+    expected, values = Fields(job.store).read([0, 1], plan.lattice.half.place_in(plan.lattice.half))
     assert np.abs(values - expected).max() < 2e-9 * whole.facts.area
 
 
@@ -140,8 +140,8 @@ def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypat
     assert compute_mesh(job, blocks) == record
 
 
-ONE_CHUNK = Lattice(5.0, 64).split(1 << 24)
-LARGE = Lattice(5.0, 512).split(1 << 24)
+ONE_CHUNK = Lattice(5.0, 64).half.split(1 << 24)
+LARGE = Lattice(5.0, 512).half.split(1 << 24)
 TRANSFORM = TransformSettings()
 
 

@@ -154,8 +154,8 @@ def test_values_near_axes_are_the_same_block_by_block() -> None:
     values = np.random.default_rng(0).normal(size=(2, *lattice.shape)) + 0j
     whole, gathered = NearAxes(lattice, 2), NearAxes(lattice, 2)
     whole.take(slice(2), lattice.half, values)
-    for block in lattice.split(500):
-        x, y, z = lattice.place(block)
+    for block in lattice.half.split(500):
+        x, y, z = block.place_in(lattice.half)
         gathered.take(slice(1, 2), block, values[1:, x, y, z])
     assert whole.images()[1].tolist() == gathered.images()[1].tolist()
     assert not gathered.images()[0].any()

@@ -164,7 +164,7 @@ def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> Non
     read = fields.read_blocks
     for module in (fields, causes):
         monkeypatch.setattr(module, "read_blocks", lambda lattice, *given: read(lattice, *given, largest=100))
-    assert len(RANDOM.split(100)) > 10
+    assert len(RANDOM.half.split(100)) > 10
     in_blocks = sb.witness(a, b, -2.0, points, eps=1e-13).values
     assert in_blocks == pytest.approx(whole, rel=0, abs=1e-11 * np.abs(whole).max())
     xr.testing.assert_allclose(sb.distance(a, b, WITNESS_ORDERS), distances, rtol=1e-12)

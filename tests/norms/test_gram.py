@@ -22,9 +22,9 @@ def test_blocks_of_products_give_every_distance() -> None:
     fields = [fourier_transform(surface, LATTICE) for surface in surfaces]
     center = fourier_transform(Sphere(), LATTICE)
     parts, own = [], []
-    for block in LATTICE.split(2_000):
+    for block in LATTICE.half.split(2_000):
         arrangement = Arrangement.for_block(WEIGHTS, block)
-        part = np.stack([(f - center).values[LATTICE.place(block)].ravel()[arrangement.order] for f in fields])
+        part = np.stack([(f - center).values[block.place_in(LATTICE.half)].ravel()[arrangement.order] for f in fields])
         parts.append(arrangement.products(part, part))
         own.append(arrangement.squares(part))
     sums, cancelled = differences(add_sums(parts), add_sums(own), add_sums(own))

@@ -207,7 +207,7 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     store = prepare_store(url, plan)
     prefix = key_of(url)
     empty = server.keys(prefix)
-    Fields(store).write(1, plan.lattice.place(plan.blocks[0]), np.zeros(plan.lattice.shape))
+    Fields(store).write(1, plan.blocks[0].place_in(plan.lattice.half), np.zeros(plan.lattice.shape))
     Records(store).write(1, Record("key", "complete"))
     write_table(store, "norms", xr.Dataset({"norm": ("mesh", np.ones(5))}))
     store.consolidate()
@@ -217,7 +217,7 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     assert server.keys(prefix) == empty
     assert Records(again).read() == (None,) * 5
     assert table_attributes(again, "norms") is None
-    assert np.isnan(Fields(again).read([1], finer.lattice.place(finer.blocks[0]))).all()
+    assert np.isnan(Fields(again).read([1], finer.blocks[0].place_in(finer.lattice.half))).all()
     assert Store.open(url).labels() == store.labels()
 
 

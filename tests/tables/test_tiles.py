@@ -43,7 +43,7 @@ def evaluator(store_path: Path, fields: NDArray[np.complex128]) -> Evaluator:
     store = prepare_store(store_path, plan)
     checksums: dict[int, tuple[int, ...]] = dict.fromkeys(range(ROWS), ())
     for block in plan.blocks:
-        place = plan.lattice.place(block)
+        place = block.place_in(plan.lattice.half)
         for row, field in enumerate(fields):
             checksums[row] += (Fields(store).write(row, place, field[place]),)
     return Evaluator(

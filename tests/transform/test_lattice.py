@@ -50,16 +50,16 @@ def test_trapezoid_weights_of_the_half_integrate_the_whole_cube() -> None:
 def test_blocks_cover_the_half_once_and_respect_their_bound(largest: int) -> None:
     lattice = Lattice(1.0, 8)
     seen = np.zeros(lattice.shape, dtype=int)
-    blocks = lattice.split(largest)
+    blocks = lattice.half.split(largest)
     for block in blocks:
         assert block.size <= largest
         # As the chunks of a regular grid do, they differ at the high ends alone.
-        for axis, part in enumerate(lattice.place(block)):
+        for axis, part in enumerate(block.place_in(lattice.half)):
             assert part.start % blocks[0].shape[axis] == 0
             assert block.shape[axis] == blocks[0].shape[axis] or part.stop == lattice.shape[axis]
-        seen[lattice.place(block)] += 1
+        seen[block.place_in(lattice.half)] += 1
         frequencies = lattice.frequencies(block)
-        for axis, part in enumerate(lattice.place(block)):
+        for axis, part in enumerate(block.place_in(lattice.half)):
             assert np.array_equal(frequencies[axis], lattice.axes[axis][part])
     assert (seen == 1).all()
 
@@ -78,7 +78,10 @@ LATTICE = Lattice(4.0, 32)
 
 def test_shell_sums_of_blocks_add_up() -> None:
     field = fourier_transform(BOX, LATTICE)
-    parts = sum(shell_sums(field.values[LATTICE.place(block)], None, LATTICE, block) for block in LATTICE.split(5_000))
+    parts = sum(
+        shell_sums(field.values[block.place_in(LATTICE.half)], None, LATTICE, block)
+        for block in LATTICE.half.split(5_000)
+    )
     whole = shell_sums(field.values, None, LATTICE, LATTICE.half)
     assert np.allclose(parts, whole, rtol=1e-13, atol=0)
     weights = SobolevWeights(LATTICE, (-2.0,))

@@ -38,7 +38,7 @@ def test_whichever_frequencies_are_drawn_their_probe_covers_the_error(surface: S
     covered, ratios = [], []
     for seed in range(100):
         draws = draw(LATTICE, PROBED_ORDERS, degree, 32, seed)
-        places = draws.places(LATTICE.half)
+        places = tuple((draws.indices - LATTICE.half.start).T)
         probe = measure(draws, field.values[places], exact.values[places].astype(np.complex128))
         reported = probe.norms(SobolevWeights(LATTICE, ORDERS))
         covered.append(reported >= true_errors)
@@ -73,9 +73,9 @@ def test_draws_among_a_fields_own_values_meet_its_peaks_without_bias() -> None:
     covered, squares = [], []
     for seed in range(200):
         draws, probes = draw(lattice, orders, 2, 8, seed), []
-        for block in lattice.split(6_000) if seed % 2 else (lattice.half,):
-            pooled = with_own(draws, draws.count, lattice, block, values[lattice.place(block)])
-            places_of_all = pooled.places(lattice.half)
+        for block in lattice.half.split(6_000) if seed % 2 else (lattice.half,):
+            pooled = with_own(draws, draws.count, lattice, block, values[block.place_in(lattice.half)])
+            places_of_all = tuple((pooled.indices - lattice.half.start).T)
             probes.append(measure(pooled, values[places_of_all], exact[places_of_all].astype(np.complex128)))
         probe = join(probes)
         covered.append(probe.norms(weights)[0] ** 2 >= true[0])
