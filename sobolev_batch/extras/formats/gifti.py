@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
+from sobolev_batch.extras.formats.shared import BYTE_ORDERS, typed, xml_events
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import BYTE_ORDERS, Raw, reals, typed, unpacked_limit, whole, xml_events
+from sobolev_batch.geometry.formats.parsing import Raw, reals, unpacked_limit, whole
 
 _MOST_DIMENSIONS = 6
 _GIFTI_TYPES = {

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError
+from sobolev_batch.extras.formats.shared import joined, placed
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, joined, placed, triangle_strips, unpacked_limit
+from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips, unpacked_limit
 from sobolev_batch.geometry.mesh import merge_coincident
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

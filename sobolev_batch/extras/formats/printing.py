@@ -17,17 +17,9 @@ import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError
+from sobolev_batch.extras.formats.shared import joined, placed, xml_events
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import (
-    Raw,
-    joined,
-    placed,
-    reals,
-    require_memory_to_read,
-    unpacked_limit,
-    whole,
-    xml_events,
-)
+from sobolev_batch.geometry.formats.parsing import Raw, reals, require_memory_to_read, unpacked_limit, whole
 
 _RELATIONS, _OF_MODEL = "_rels/.rels", "/3dmodel"
 _UNIT, _SUPPORTS = "millimeter", ("support", "solidsupport")

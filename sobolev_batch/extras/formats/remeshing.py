@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
+from sobolev_batch.extras.formats.shared import SURFACE, beside_volume
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import SURFACE, Raw, beside_volume, reals, whole
+from sobolev_batch.geometry.formats.parsing import Raw, reals, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
 # Medit's cells with volume, and words of sections that have no part in a surface.

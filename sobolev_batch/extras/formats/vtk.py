@@ -16,18 +16,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
+from sobolev_batch.extras.formats.shared import BYTE_ORDERS, SURFACE, beside_volume, typed, xml_events
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import (
-    BYTE_ORDERS,
-    SURFACE,
-    Raw,
-    beside_volume,
-    triangle_strips,
-    typed,
-    unpacked_limit,
-    whole,
-    xml_events,
-)
+from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips, unpacked_limit, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
 # VTK's numbers for types of cells: vertices and lines, those with area, of two corners at most, and those with flat

@@ -8,15 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
+from sobolev_batch.geometry.formats import plain_formats
 from sobolev_batch.geometry.formats.parsing import Raw, is_gzipped
-from sobolev_batch.geometry.formats.plain_formats import (
-    parse_obj,
-    parse_off,
-    parse_stl,
-    write_obj,
-    write_off,
-    write_stl,
-)
 from sobolev_batch.geometry.formats.ply import announced_size, parse_ply, write_ply
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.plugins import FORMATS, registered
@@ -51,9 +44,9 @@ class Format:
 
 _PLAIN = (
     Format((".ply",), parse_ply, 19, 110, write_ply, announced_size=announced_size),
-    Format((".obj",), parse_obj, 35, 240, write_obj),
-    Format((".stl",), parse_stl, 50, 270, write_stl),
-    Format((".off",), parse_off, 35, 240, write_off),
+    Format((".obj",), plain_formats.parse_obj, 35, 240, plain_formats.write_obj),
+    Format((".stl",), plain_formats.parse_stl, 50, 270, plain_formats.write_stl),
+    Format((".off",), plain_formats.parse_off, 35, 240, plain_formats.write_off),
 )
 
 

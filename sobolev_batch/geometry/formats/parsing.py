@@ -1,4 +1,4 @@
-"""What parsers share: the bytes of regular files, unpacked but bounded; XML in small parts; strips as triangles."""
+"""What parsers share: the bytes of regular files, unpacked but bounded; words as numbers; strips as triangles."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ import re
 import stat
 import zlib
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePath
-from typing import IO, Any, Literal, NamedTuple, cast
-from xml.parsers import expat
+from typing import IO, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
 from sobolev_batch.machine import machine_memory
 from sobolev_batch.parameters import format_bytes
@@ -44,24 +43,14 @@ _LARGEST_PACKING, _HARMLESS_BYTES = 100, 16 << 20
 _CHUNK_BYTES = 1 << 20
 # Part of the machine's memory that reading a file may take; others use it too.
 _MEMORY_PART = 0.75
-# XML that parsers would go through again and again, or hold in memory many times over: one tag with its attributes,
-# comment or instruction, elements within each other, and elements in all. Those of surfaces are a few hundred bytes,
-# five deep and a few hundred.
-_LONGEST_MARKUP, _DEEPEST, _MOST_ELEMENTS = 1 << 16, 100, 100_000
-_XML_BYTES = 1 << 14
-# What NumPy calls the orders of bytes that files of XML name.
-BYTE_ORDERS: dict[str, Literal["<", ">"]] = {"LittleEndian": "<", "BigEndian": ">"}
 # Lines per row, at most, of a text whose lines hold several rows: damage alone joins fewer.
 MOST_LINES = 0.9
 # Digits of an integer: all that fit into 64 bits.
 _MOST_DIGITS = 18
 _REAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
-_INTEGERS = re.compile("[-+0-9]*")
 # Fortran writes the exponents of doubles with a D, and Windows what is no number as -nan(ind) or 1.#QNAN.
 _FORTRAN = re.compile(r"(?<=[0-9.])[dD](?=[+-]?[0-9])")
 _NO_NUMBER = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.ASCII | re.IGNORECASE)
-# The command that takes the surface of cells with volume.
-SURFACE = "python -c \"import pyvista; pyvista.read('scan{}').extract_surface().triangulate().save('scan.vtp')\""
 # The index that ends a strip of triangles within a list.
 _BREAK = -1
 
@@ -137,54 +126,6 @@ def unpacked_limit(packed_bytes: int) -> int:
     return min(_LARGEST_BYTES, max(_HARMLESS_BYTES, _LARGEST_PACKING * packed_bytes))
 
 
-def xml_events(
-    data: bytes, kind: str, most_elements: int = _MOST_ELEMENTS
-) -> Iterator[tuple[str, str, dict[str, str]]]:
-    """Parse XML a little at a time, and refuse what would take memory out of proportion in a file of some kind.
-
-    Yield ("start", name, attributes) and ("end", name, {}) of each element, and ("text", piece, {}) between them.
-    """
-    events: list[tuple[str, str, dict[str, str]]] = []
-    heard = 0
-
-    def refuse_entity(name: str, *_: object) -> None:
-        raise MeshError(f"the XML declares the entity {name[:40]!r}; a {kind} file has none, write it without")
-
-    def hear(_: str) -> None:
-        nonlocal heard
-        heard += 1
-
-    parser = expat.ParserCreate()
-    parser.buffer_text = True
-    parser.EntityDeclHandler, parser.DefaultHandlerExpand = refuse_entity, hear
-    parser.StartElementHandler = lambda name, attributes: events.append(("start", name, attributes))
-    parser.EndElementHandler = lambda name: events.append(("end", name, {}))
-    parser.CharacterDataHandler = lambda piece: events.append(("text", piece, {}))
-    silent = depth = elements = 0
-    for place in range(0, len(data), _XML_BYTES):
-        heard = 0
-        parser.Parse(memoryview(data)[place : place + _XML_BYTES], False)
-        # The parser tells of text at once, and keeps everything else until it is complete.
-        silent = 0 if heard or events else silent + _XML_BYTES
-        if silent > _LONGEST_MARKUP:
-            raise MeshError(
-                f"the XML has an attribute, name or comment of more than {_LONGEST_MARKUP} bytes, which goes on "
-                f"at byte {place + _XML_BYTES}; a {kind} file has none, write it without"
-            )
-        for event in events:
-            elements += event[0] == "start"
-            depth += (event[0] == "start") - (event[0] == "end")
-            if depth > _DEEPEST or elements > most_elements:
-                raise MeshError(
-                    f"the XML has element {elements} at the depth {depth}; a {kind} file has at most {most_elements} "
-                    f"elements, nested up to {_DEEPEST} deep: save it with the surface alone"
-                )
-            yield event
-        events.clear()
-    parser.Parse(b"", True)
-    yield from events
-
-
 def _unpacked_bounded(packed: bytes, factor: float) -> bytes:
     """Return what packed bytes hold; they are refused as soon as that exceeds a bound."""
     most = unpacked_limit(len(packed))
@@ -238,30 +179,6 @@ def as_declared(numbers: NDArray[Any] | array[float], declared: DTypeLike, owner
     if len(wrong):
         raise MeshError(f"{owner} has {wrong[0]:g} for an integer of {8 * converted.itemsize} bits")
     return converted
-
-
-def typed(words: Sequence[str], dtype: np.dtype[Any], owner: str) -> NDArray[Any]:
-    """Return words as numbers of a type; an error begins with their owner."""
-    if dtype.kind in "iu" and not _INTEGERS.fullmatch("".join(words)):
-        raise MeshError(f"{owner} has fractions or other words for integers")
-    return as_declared(reals(words, owner), dtype, owner)
-
-
-def beside_volume(cells: int, faces: int) -> tuple[str, ...]:
-    """Return what notes say of cells with volume, which have no part in the surface of the faces beside them."""
-    return (f"{cells:,} cells with volume are left out beside {faces:,} faces",) if cells else ()
-
-
-def placed(vertices: Reals, triangles: Indices, linear: Reals, shift: Reals) -> tuple[Reals, Indices]:
-    """Return vertices x as x @ linear + shift, and their triangles, which a mirror turns round."""
-    return vertices @ linear + shift, triangles[:, :: -1 if np.linalg.det(linear) < 0 else 1]
-
-
-def joined(parts: Sequence[tuple[Reals, Indices]]) -> tuple[Reals, Indices]:
-    """Return the vertices (n, 3) and triangles (m, 3) of parts as those of one mesh."""
-    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    triangles = [indices + offset for (_, indices), offset in zip(parts, offsets[:-1], strict=True)]
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(triangles)
 
 
 def triangle_strips(corners: Indices, sizes: Indices) -> Indices:
