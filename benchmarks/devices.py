@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -50,7 +51,7 @@ def on_a_gpu(effort: Effort) -> Iterator[Row]:
         yield Row("9", f"not run: {error}")
         return
     # As in a long study: in the first second of work, meshes are measured without compiled loops.
-    compiled.use()
+    compiled.pays(math.inf)
     runtime = gpu.cupy.cuda.runtime
     yield Row("9", f"device: {gpu.description}, driver for CUDA {runtime.driverGetVersion()}")
     bandwidth = _bandwidth(gpu, effort.repeats)

@@ -182,11 +182,8 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
         return record
     started = time.perf_counter()
     try:
-        # Another worker that computes them again must write the same bytes.
-        with compiled.by_itself():
-            if job.tail is not None:
-                # Octaves take long enough for loops to pay.
-                compiled.use()
+        # Another worker that computes them again must write the same bytes. Octaves take long enough for loops to pay.
+        with compiled.by_itself(loops=job.tail is not None):
             surface, stored = job.load(), []
             target = job.error_target(surface)
             if blocks:

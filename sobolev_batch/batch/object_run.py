@@ -176,9 +176,8 @@ def begin(study: Study, location: Location, workers: Workers | None) -> Begun | 
     Digits do not depend on what else the process computes. Without workers, of which this one has no more memory than
     any, nothing is computed.
     """
-    with compiled.by_itself():
-        # A worker plans many objects, for which compiling pays.
-        compiled.use()
+    # A worker plans many objects, for which compiling pays.
+    with compiled.by_itself(loops=True):
         workspace = Workspace.of_study(study, location)
     if (before := ended_already(workspace)) is not None:
         return before, {}

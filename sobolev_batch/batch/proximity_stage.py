@@ -110,8 +110,7 @@ def measure_proximity(
         tolerance = dict(pair[0][0].member.metadata).get("target_tolerance")
         within = _BELOW * tolerance * similarity.scale if isinstance(tolerance, float) else None
         # Digits, and bounds with them, do not depend on what else the process computes.
-        with compiled.by_itself():
-            compiled.use()
+        with compiled.by_itself(loops=True):
             meshes, points = (_load(*mesh, similarity) for mesh in pair), requested.points
             found, _ = proximity.proximity_and_deviations(*meshes, points=points, threshold=limit, within=within)
         lengths = {name: found[name] / similarity.scale for name in proximity.LENGTHS}

@@ -23,9 +23,9 @@ _adding = Lock()
 
 
 @contextmanager
-def by_itself() -> Iterator[None]:
-    """Count only the work within, so that its digits do not depend on what the process did before, or does beside."""
-    token = _spent.set([0.0])
+def by_itself(*, loops: bool) -> Iterator[None]:
+    """Let loops pay at once or as the work within goes on, so that its digits do not depend on any other work."""
+    token = _spent.set([math.inf if loops else 0.0])
     try:
         yield
     finally:
@@ -41,11 +41,6 @@ def pays(seconds: float) -> bool:
     with _adding:
         spent[0] += seconds
         return spent[0] > _WORTH_SECONDS
-
-
-def use() -> None:
-    """Let loops pay from now on, whatever the process has done before: what it stores then depends on nothing else."""
-    pays(math.inf)
 
 
 def loop(function: Loop) -> Loop:

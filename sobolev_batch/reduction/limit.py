@@ -184,8 +184,7 @@ def tried(reference_member: Member, member: Member, limit: Limit, size: float) -
     reference, started = load_mesh(reference_member), time.perf_counter()
     mesh, reason, bounds = None, "", (math.inf,) * 3
     # A search that was ended goes on in another process, by the same bounds.
-    with compiled.by_itself():
-        compiled.use()
+    with compiled.by_itself(loops=True):
         if limit.measure in _OF_ONE_MESH:
             # What is not known of the reference is known of no mesh.
             limit.bounds(reference, reference)

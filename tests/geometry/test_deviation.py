@@ -187,9 +187,9 @@ def test_points_of_a_thin_triangle_have_the_distance_zero(height: float) -> None
     rng = np.random.default_rng(3)
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0.4, height, 0]]) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
     triangles, points = Triangles(sb.Mesh(vertices, [[0, 1, 2]])), rng.dirichlet([1, 1, 1], size=100) @ vertices
-    with compiled.by_itself():
+    with compiled.by_itself(loops=False):
         assert triangles.squares(points.T / triangles.scale, np.zeros(100, dtype=int)).max() < 1e-31
-        compiled.use()
+    with compiled.by_itself(loops=True):
         assert triangles.closest(points)[0].max() < 3e-16
 
 
@@ -271,9 +271,9 @@ def test_the_compiled_loop_gives_the_distances_of_the_arrays() -> None:
     triangles = Triangles(sb.Mesh(corners.reshape(-1, 3), np.arange(900).reshape(-1, 3)))
     points = np.concatenate([corners.mean(axis=1), corners[:, 0], rng.normal(size=(300, 3))]).T / triangles.scale
     tried = np.tile(np.arange(300), 3)
-    with compiled.by_itself():
+    with compiled.by_itself(loops=False):
         arrays = triangles.squares(points, tried)
-        compiled.use()
+    with compiled.by_itself(loops=True):
         loop = triangles.squares(points, tried)
     np.testing.assert_allclose(loop, arrays, rtol=1e-9, atol=1e-28)
     assert not loop[300:600].any()

@@ -126,7 +126,7 @@ def test_a_plan_takes_the_mesh_of_a_first_trial_for_that_of_a_search(
 def test_a_trial_does_not_depend_on_what_the_process_did_before(within: str, folder: Path) -> None:
     search, found = member(folder, DECIMATED | {"within": within}).search, []  # type: ignore[attr-defined]
     for seconds in (0.0, math.inf):
-        with compiled.by_itself():
+        with compiled.by_itself(loops=False):
             compiled.pays(seconds)
             trial, _ = limits.tried(*search.trial(search.begun(), 200.0))
         found.append(replace(trial, seconds=0.0))
