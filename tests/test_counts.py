@@ -18,7 +18,7 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
-from sobolev_batch.geometry.formats import parsing, readers
+from sobolev_batch.geometry.formats import parsing
 from sobolev_batch.sources import files
 from sobolev_batch.sources.command import CommandSource
 from sobolev_batch.tables.other_orders import convergence_at
@@ -187,7 +187,7 @@ def counts(monkeypatch: pytest.MonkeyPatch) -> Counts:
         monkeypatch.setattr(kind, name, call)
 
     opened, now = parsing.open_regular, time.time_ns
-    for module in (parsing, readers, files):
+    for module in (parsing, files):
         monkeypatch.setattr(module, "open_regular", lambda path: Counted(opened(path).detach()))
     monkeypatch.setattr(time, "time_ns", lambda: now() + 10**10)
     counting(files.FileSource, "members", "lists of files")

@@ -20,7 +20,7 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, SerializeAsAny
 
-from sobolev_batch.errors import MeshError, StudyError, from_extra
+from sobolev_batch.errors import MeshError, StudyError, from_extra, naming
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface, is_finite_number
 from sobolev_batch.plugins import SOURCES, registered
@@ -361,10 +361,8 @@ def parse_source(table: Mapping[str, Any]) -> Source:
 def _parse_nested(table: object) -> Source:
     if not isinstance(table, dict):
         raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
-    try:
+    with naming(f"the table {quoted(table)}"):
         return parse_source(table)
-    except StudyError as error:
-        raise StudyError(f"the table {quoted(table)}: {error}") from error
 
 
 # A source within the table of another one.

@@ -15,17 +15,8 @@ from zipfile import BadZipFile
 import numpy as np
 
 from sobolev_batch.errors import MeshError
+from sobolev_batch.geometry.formats import parsing
 from sobolev_batch.geometry.formats.by_name import BY_SUFFIX, CONVERTED, mesh_format
-from sobolev_batch.geometry.formats.parsing import (
-    Raw,
-    Read,
-    checked_length,
-    is_packed,
-    open_regular,
-    read_unpacked,
-    require_memory_to_read,
-    unpacked_limit,
-)
 from sobolev_batch.geometry.formats.ply import HEADER_BYTES
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.parameters import path_of
@@ -99,7 +90,7 @@ def files_beside(path: Path) -> tuple[Path, ...]:
     if form is None or form.files_beside is None:
         return ()
     try:
-        data = read_unpacked(path, form.memory_bytes / form.file_bytes)
+        data = parsing.read_unpacked(path, form.memory_bytes / form.file_bytes)
         return tuple(_files_beside(path, form.files_beside(data)).values())
     except Exception:
         # Parsers raise anything; reading the mesh tells what is wrong.
@@ -119,7 +110,7 @@ def _files_beside(path: Path, names: Iterable[str]) -> dict[str, Path]:
     return found
 
 
-def read_mesh_by(path: Path, read: Read) -> Mesh:
+def read_mesh_by(path: Path, read: parsing.Read) -> Mesh:
     """Read a mesh as `read_mesh` does, by a function that reads the bytes of its file."""
     suffix = mesh_format(path)
     if suffix in CONVERTED:
@@ -137,18 +128,19 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
     factor = form.memory_bytes / form.file_bytes
     try:
         # The header of a PLY file tells more than its length.
-        require_memory_to_read(expected_size(path)[1])
-        data = [read_unpacked(path, factor, read)]
+        parsing.require_memory_to_read(expected_size(path)[1])
+        data = [parsing.read_unpacked(path, factor, read)]
         start = data[0][:_START_BYTES]
         # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
             beside = []
             if form.files_beside is not None:
                 parts = _files_beside(path, form.files_beside(data[0]))
-                require_memory_to_read(factor * (len(data[0]) + sum(part.stat().st_size for part in parts.values())))
-                beside = [{name: read_unpacked(part, factor, read) for name, part in parts.items()}]
+                size = len(data[0]) + sum(part.stat().st_size for part in parts.values())
+                parsing.require_memory_to_read(factor * size)
+                beside = [{name: parsing.read_unpacked(part, factor, read) for name, part in parts.items()}]
             # Only the parser holds the bytes, so that it can free them early.
-            raw = _without_unused(Raw(*form.parse(data.pop(), *beside)))
+            raw = _without_unused(parsing.Raw(*form.parse(data.pop(), *beside)))
             for array in (raw.vertices, raw.triangles):
                 array.setflags(write=False)
             return _with_lost_digits(Mesh(*raw), raw.vertices.dtype.newbyteorder("=") == np.float32)
@@ -173,10 +165,10 @@ def expected_size(path: Path) -> tuple[int, float]:
     if form is None:
         return 0, 0.0
     try:
-        with open_regular(path) as file:
-            length, packed = checked_length(file), is_packed(path, file)
+        with parsing.open_regular(path) as file:
+            length, packed = parsing.checked_length(file), parsing.is_packed(path, file)
             if packed:
-                length = min(_PACKING * length, unpacked_limit(length))
+                length = min(_PACKING * length, parsing.unpacked_limit(length))
             if form.announced_size is not None:
                 unpacked = gzip.GzipFile(fileobj=file) if packed else file
                 return form.announced_size(unpacked.read(HEADER_BYTES).removeprefix(codecs.BOM_UTF8), length)
@@ -188,7 +180,7 @@ def expected_size(path: Path) -> tuple[int, float]:
     return triangles, float(triangles * form.memory_bytes)
 
 
-def _without_unused(raw: Raw) -> Raw:
+def _without_unused(raw: parsing.Raw) -> parsing.Raw:
     """Leave out vertices that are no numbers and that no triangle uses, with a note."""
     vertices, triangles, notes = raw
     if not np.isfinite(vertices).all() and 0 <= triangles.min() <= triangles.max() < len(vertices):
@@ -196,7 +188,7 @@ def _without_unused(raw: Raw) -> Raw:
         if not is_bad[triangles].any():
             vertices, triangles = vertices[~is_bad], (np.cumsum(~is_bad) - 1)[triangles]
             notes += (f"{np.count_nonzero(is_bad):,} vertices without coordinates, which no face uses, are left out",)
-    return Raw(vertices, triangles, notes)
+    return parsing.Raw(vertices, triangles, notes)
 
 
 def _with_lost_digits(mesh: Mesh, is_single: bool) -> Mesh:

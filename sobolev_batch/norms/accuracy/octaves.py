@@ -276,8 +276,7 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: 
     solution = solution_of(state)
     if np.all(problem.accuracy.met(solution.estimate)):
         return solution
-    limits = "with as many frequencies as can be sampled in some minutes"
-    return replace(solution, shortfall=problem.out_of_reach(solution.estimate, limits))
+    return replace(solution, shortfall=problem.out_of_reach(solution.estimate))
 
 
 def solution_of(state: State) -> Solution:

@@ -37,6 +37,8 @@ _MOVED_FRACTION = 0.1
 _LEAST_MOVE = 1 / 8
 # Part of a norm below which a distance is not measured that roundings of files explain.
 _ROUNDED = 1e-2
+# What limits octaves.
+_BY_TIME = "with as many frequencies as can be sampled in some minutes"
 # An accuracy called reachable must hold when it is requested.
 _REACHABLE_MARGIN = 1.3
 
@@ -233,7 +235,7 @@ class Problem:
                 reachable,
             )
 
-    def out_of_reach(self, found: NormEstimate, limits: str) -> AccuracyError:
+    def out_of_reach(self, found: NormEstimate, limits: str = _BY_TIME) -> AccuracyError:
         """Return the error for an accuracy out of reach, from the nearest that was reached and what limits it."""
         relative = found.errors / found.values
         worst = int(np.argmax(relative))

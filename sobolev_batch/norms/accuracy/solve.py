@@ -151,8 +151,7 @@ def _in_coarser_octaves(problem: Problem, seed: int) -> list[Solution]:
             solution = solve_in_octaves(problem.with_rtol(rtol), seed)
         except AccuracyError:
             break
-        limits = "with as many frequencies as can be sampled in some minutes"
-        found.append(replace(solution, shortfall=problem.out_of_reach(solution.estimate, limits)))
+        found.append(replace(solution, shortfall=problem.out_of_reach(solution.estimate)))
         if solution.shortfall is not None:
             break
     return found
