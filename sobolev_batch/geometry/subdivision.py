@@ -1,7 +1,6 @@
 """Subdivision of a mesh at some of its edges, without vertices inside of edges; and icospheres, made by it."""
 
 import math
-from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -85,20 +84,6 @@ class Edges:
         vertices = np.asarray(self.mesh.vertices)
         return np.asarray(np.linalg.norm(vertices[self.ends[:, 0]] - vertices[self.ends[:, 1]], axis=1))
 
-    def best(self, scores: Reals, triangles: int) -> Marks:
-        """Mark the edges of the triangles with the largest scores (m,), to lead to at most this many triangles.
-
-        Where an edge of a triangle is marked, so is its longest one: then triangles do not become ever thinner. Source:
-        M. C. Rivara, "Algorithms for refining triangular grids suitable for adaptive and multigrid techniques" (1984),
-        doi:10.1002/nme.1620200412.
-        """
-        order = np.argsort(-scores, kind="stable")
-
-        def triangles_after(number: int) -> int:
-            return len(self.sides) + int(np.count_nonzero(self._completed(order[:number])[self.sides]))
-
-        return self._completed(order[: bisect_right(range(1, len(order) + 1), triangles, key=triangles_after)])
-
     def split(self, marks: Marks) -> Mesh:
         """Return the mesh with new vertices, after its own, at the middles of marked edges; of two cuts the shorter."""
         count = len(self.mesh.vertices)
@@ -124,17 +109,6 @@ class Edges:
         parents = np.concatenate([np.flatnonzero(chosen) for chosen, pieces_of in pieces for _ in pieces_of])
         # Pieces of a triangle follow each other: what is near in space stays near in memory.
         return Mesh(vertices, np.concatenate(cut)[np.argsort(parents, kind="stable")])
-
-    def _completed(self, chosen: Indices) -> Marks:
-        """Mark the edges of triangles, and the longest edge of every triangle that has a marked one."""
-        longest = np.take_along_axis(self.sides, self.lengths[self.sides].argmax(axis=1)[:, None], axis=1)[:, 0]
-        marks = np.zeros(len(self.ends), dtype=bool)
-        added = self.sides[chosen].ravel()
-        while len(added):
-            marks[added] = True
-            touched = longest[marks[self.sides].any(axis=1)]
-            added = touched[~marks[touched]]
-        return marks
 
 
 def _icosahedron() -> Mesh:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from sobolev_batch.extras.fitting.objective import FitProblem, FitSettings, Orde
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import proximity
-from sobolev_batch.geometry.subdivision import Edges
+from sobolev_batch.geometry.subdivision import Edges, Marks
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.distances import distance
 from sobolev_batch.norms.fields import Operand, OperandLike, as_operand
@@ -403,7 +404,31 @@ def _split(problem: FitProblem, mesh: Mesh, triangles: int) -> Mesh:
     scores = edges.lengths * np.linalg.norm(at_middles, axis=1)
     if problem.settings.keep_boundary:
         scores[edges.on_boundary] = 0.0
-    return edges.split(edges.best(scores[edges.sides].sum(axis=1), triangles))
+    return edges.split(best_edges(edges, scores[edges.sides].sum(axis=1), triangles))
+
+
+def best_edges(edges: Edges, scores: Reals, triangles: int) -> Marks:
+    """Mark the edges of the triangles with the largest scores (m,), to lead to at most this many triangles.
+
+    Where an edge of a triangle is marked, so is its longest one: then triangles do not become ever thinner. Source: M.
+    C. Rivara, "Algorithms for refining triangular grids suitable for adaptive and multigrid techniques" (1984),
+    doi:10.1002/nme.1620200412.
+    """
+    order, sides = np.argsort(-scores, kind="stable"), edges.sides
+    longest = np.take_along_axis(sides, edges.lengths[sides].argmax(axis=1)[:, None], axis=1)[:, 0]
+
+    def marked(number: int) -> Marks:
+        marks, added = np.zeros(len(edges.ends), dtype=bool), sides[order[:number]].ravel()
+        while len(added):
+            marks[added] = True
+            touched = longest[marks[sides].any(axis=1)]
+            added = touched[~marks[touched]]
+        return marks
+
+    def triangles_after(number: int) -> int:
+        return len(sides) + int(np.count_nonzero(marked(number)[sides]))
+
+    return marked(bisect_right(range(1, len(order) + 1), triangles, key=triangles_after))
 
 
 def largest_while_refining(count: int, triangles: int) -> int:

@@ -25,6 +25,7 @@ from sobolev_batch.extras.fitting.descent import (
 from sobolev_batch.extras.fitting.objective import FitSettings
 from sobolev_batch.geometry.subdivision import Edges
 from sobolev_batch.sources.derived import decimated
+from tests.geometry.test_subdivision import open_mesh
 
 
 def bumpy(level: int) -> sb.Mesh:
@@ -286,3 +287,33 @@ def test_narrow_integers_of_numpy_do_not_overflow() -> None:
     settings = FitSettings(steps=steps, smoothing=smoothing)
     assert 3 * settings.steps == 300
     assert type(settings.smoothing) is float
+
+
+@pytest.mark.parametrize("wanted", [320, 321, 330, 500, 1000, 1279, 1280, 10_000])
+def test_the_best_triangles_are_as_many_as_fit(wanted: int) -> None:
+    edges = Edges.from_mesh(sb.shapes.icosphere(2))
+    # Scores that fall from one point on, as those of a place with much detail do.
+    scores = -np.linalg.norm(np.asarray(edges.mesh.vertices)[edges.mesh.triangles].mean(axis=1) - [0.1, 0.2, 1], axis=1)
+    marks = module.best_edges(edges, scores, wanted)
+    count = len(edges.split(marks).triangles)
+    assert count == 1280 if wanted > 1280 else wanted - 20 < count <= wanted
+    split = marks[edges.sides].all(axis=1)
+    if 330 < wanted < 1279:
+        assert np.quantile(scores[split], 0.1) > np.median(scores[~split])
+    longest = edges.lengths[edges.sides].argmax(axis=1)
+    touched = marks[edges.sides].any(axis=1)
+    assert marks[edges.sides[np.arange(len(longest)), longest]][touched].all()
+
+
+def test_triangles_do_not_become_ever_thinner() -> None:
+    mesh = open_mesh()
+    first = mesh.smallest_angles.min()
+    rng = np.random.default_rng(5)
+    for _ in range(8):
+        edges = Edges.from_mesh(mesh)
+        # Always near one place, where thin triangles would pile up.
+        distances = np.linalg.norm(np.asarray(mesh.vertices)[mesh.triangles].mean(axis=1) - [0, 0, 1], axis=1)
+        mesh = edges.split(
+            module.best_edges(edges, -distances + 0.01 * rng.random(len(distances)), len(mesh.triangles) + 40)
+        )
+    assert mesh.smallest_angles.min() > first / 2.5
