@@ -274,14 +274,6 @@ def check_lattice(lattice: object) -> Lattice:
     return lattice
 
 
-def field_values(field: xr.DataArray) -> Complexes:
-    """Return all samples of a field, complex128 on the half lattice; refuse any that is not finite."""
-    values = np.asarray(field.transpose(*AXES).to_numpy(), dtype=np.complex128)
-    if not np.isfinite(values).all():
-        raise InputError(f"the field has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
-    return values
-
-
 def pair_of(
     a: OperandLike, b: OperandLike, lattice: Lattice | None, orders: Sequence[float]
 ) -> tuple[xr.DataArray, xr.DataArray]:

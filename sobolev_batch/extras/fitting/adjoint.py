@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+import xarray as xr
 from scipy.sparse import coo_array, csr_array, vstack
 
 from sobolev_batch.arrays import Complexes, Indices, Reals
@@ -12,7 +13,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import normals
 from sobolev_batch.transform.fourier import ON_CPU, Execution, TransformSettings, require_points_inside
-from sobolev_batch.transform.lattice import Lattice
+from sobolev_batch.transform.lattice import AXES, Lattice
 from sobolev_batch.transform.nufft import WeightedPoints, transform_points
 from sobolev_batch.transform.nufft_costs import NufftSpec
 from sobolev_batch.transform.quadrature import RuleUse, assign_rules, quarters
@@ -157,3 +158,11 @@ def _node_matrices(mesh: Mesh, use: RuleUse) -> Iterator[tuple[csr_array, csr_ar
         corners, coefficients = np.repeat(triangles, count, axis=0), np.tile(inner, (len(triangles), 1))
         shares = np.arange(len(corners)), np.repeat(members, count)
         yield matrices(corners, coefficients, *shares, np.tile(inner_weights, len(triangles)))
+
+
+def field_values(field: xr.DataArray) -> Complexes:
+    """Return all samples of a field, complex128 on the half lattice; refuse any that is not finite."""
+    values = np.asarray(field.transpose(*AXES).to_numpy(), dtype=np.complex128)
+    if not np.isfinite(values).all():
+        raise InputError(f"the field has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
+    return values

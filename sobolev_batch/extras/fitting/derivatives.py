@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError, from_extra
-from sobolev_batch.extras.fitting.adjoint import MeshTransform
+from sobolev_batch.extras.fitting.adjoint import MeshTransform, field_values
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent
@@ -20,15 +20,7 @@ from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.budget import Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.norms.columns import NUMBER, VARIABLES, labelled, lattice_attributes
 from sobolev_batch.norms.estimate import PARTS
-from sobolev_batch.norms.fields import (
-    Operand,
-    OperandLike,
-    as_operand,
-    common_lattice,
-    field_of,
-    field_values,
-    quality_of,
-)
+from sobolev_batch.norms.fields import Operand, OperandLike, as_operand, common_lattice, field_of, quality_of
 from sobolev_batch.norms.tail.integrals import squared_moduli
 from sobolev_batch.transform.backends import backend_named
 from sobolev_batch.transform.fourier import Execution, TransformSettings, thread_count

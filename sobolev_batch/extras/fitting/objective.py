@@ -10,7 +10,7 @@ import xarray as xr
 from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
-from sobolev_batch.extras.fitting.adjoint import MeshTransform
+from sobolev_batch.extras.fitting.adjoint import MeshTransform, field_values
 from sobolev_batch.extras.fitting.derivatives import SquaredDistance, factors_of, squares_of
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.subdivision import Edges
@@ -18,16 +18,7 @@ from sobolev_batch.geometry.surface import Extent, Similarity, centering, is_fin
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.norms.budget import Support
-from sobolev_batch.norms.fields import (
-    USUAL_DEGREE,
-    Operand,
-    Quality,
-    common_lattice,
-    field_for,
-    field_of,
-    field_values,
-    quality_of,
-)
+from sobolev_batch.norms.fields import USUAL_DEGREE, Operand, Quality, common_lattice, field_for, field_of, quality_of
 from sobolev_batch.parameters import check_flags, is_whole_number
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, single_order

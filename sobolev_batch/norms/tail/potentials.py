@@ -136,10 +136,7 @@ class Kernels:
         places = np.minimum((_scale(np.sqrt(squares), self.cutoff) - self.start) / self.step, len(table) - 1.5001)
         entries = np.where(places > 1, places + 0.5, 1.0).astype(np.int64)  # NaN stays what it is
         offsets, middle = np.maximum(places, 0.0) - entries, table[entries]
-        low, high = (
-            ((0.5 - offsets) * (0.5 - offsets) / 2)[..., None],
-            ((0.5 + offsets) * (0.5 + offsets) / 2)[..., None],
-        )
+        low, high = ((beyond * beyond / 2)[..., None] for beyond in (0.5 - offsets, 0.5 + offsets))
         return middle + low * (table[entries - 1] - middle) + high * (table[entries + 1] - middle)
 
 
