@@ -16,13 +16,13 @@ from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.league import League
 from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.tables.convergence import EDGE_LENGTH
-from sobolev_batch.tables.open import AnyStore, Families, as_tree, finished_group
+from sobolev_batch.tables.open import AnyStore, as_tree, finished_group
 
 with from_extra("plot", "a plot needs"):
     from matplotlib.axes import Axes
 
     from sobolev_batch.extras.figures.drawing import COST_LEAGUE, LEAGUE, PLOTS, RATES
-    from sobolev_batch.extras.figures.selection import Selection
+    from sobolev_batch.extras.figures.selection import Families, Selection
     from sobolev_batch.extras.figures.views import PICTURE_LIMITS, Axis, draw_witness, make_views
 
 __all__ = ["convergence", "energy", "league", "matrix", "over_time", "spectrum", "witness"]

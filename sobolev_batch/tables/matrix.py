@@ -1,6 +1,6 @@
 """Distances of every mesh to every other and to the reference, order by order."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import pandas as pd
@@ -12,7 +12,7 @@ from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import PARTS, quotients
 from sobolev_batch.parameters import check_choice
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
+from sobolev_batch.tables.open import AnyStore, as_tree, reference_of
 from sobolev_batch.tables.other_orders import distances_at, norms_at, order_note
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import middle_cut, with_error
@@ -23,23 +23,6 @@ _COLUMNS = ("distance", "error", *PARTS)
 _MOST_MESHES = 20
 _LONGEST_LABEL = 30
 _NOTE = "Errors are meant as bounds. The columns have the numbers of the rows; the matrix is symmetric."
-
-
-def pairs_of(
-    tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
-) -> xr.Dataset | None:
-    """Return `distance` and `error` of one order between the computed meshes, over `mesh` and `other`, symmetric.
-
-    They may be limited to the first ones, or to some labels, and the reference. None without distances of all pairs.
-    """
-    stored = finished_group(tree, "distances", load=False)
-    if stored.sizes["other"] != stored.sizes["mesh"]:
-        return None
-    reference, complete = reference_of(tree), complete_meshes(tree)
-    wanted = {*complete} if among is None else {*among}
-    others = [label for label in complete if label != reference and label in wanted]
-    kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
-    return distances_at(tree, order)[["distance", "error"]].sel(order=order, mesh=kept, other=kept).load()
 
 
 def matrix(

@@ -15,8 +15,7 @@ import xarray as xr
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.fields import Quality
-from sobolev_batch.parameters import as_names
-from sobolev_batch.sources.names import fits, quoted
+from sobolev_batch.sources.names import quoted
 from sobolev_batch.store import layout
 from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import Store
@@ -27,9 +26,6 @@ from sobolev_batch.tables.all_objects import concatenated
 from sobolev_batch.visible import FILE_UNITS
 
 _log = logging.getLogger(__name__)
-
-# Names of families, or globs of names; None is all of them.
-Families = str | Sequence[str] | None
 
 AnyStore = str | Path | Location | xr.DataTree
 # The store of several objects, or of an only one; or stores of single objects by their names.
@@ -287,26 +283,6 @@ def families_of(tree: xr.DataTree) -> dict[str, str]:
     """Return the family of each mesh by its label, in the order of the study."""
     meshes = finished_group(tree, "meshes", load=False)
     return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
-
-
-def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
-    """Return the families that names or globs choose, in the study's order; InputError if one fits none of it."""
-    known = list(dict.fromkeys(families_of(tree).values()))
-    if family is None:
-        return known
-    chosen: set[str] = set()
-    for pattern in as_names(family):
-        # A name may have characters that mean something else in a glob.
-        fitting = [pattern] if pattern in known else [name for name in known if fits(name, pattern)]
-        if not fitting:
-            raise InputError(f"the study has no family {quoted(pattern)}, only {', '.join(known)}")
-        chosen.update(fitting)
-    return [name for name in known if name in chosen]
-
-
-def has_times(tree: xr.DataTree) -> bool:
-    """Return True if any mesh of the store has a time."""
-    return "time" in finished_group(tree, "meshes", load=False).coords
 
 
 def metadata_of(tree: xr.DataTree) -> list[str]:

@@ -30,7 +30,6 @@ from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.tables.conclusion import format_objects, format_verdict
 from sobolev_batch.tables.convergence import format_table
 from sobolev_batch.tables.export import export
-from sobolev_batch.tables.open import chosen_families
 from sobolev_batch.tables.smallest import format_smallest
 from tests.support.commands import call
 from tests.support.stores import flip
@@ -607,7 +606,6 @@ def test_a_part_is_found_however_its_accents_are_encoded(tmp_path: Path, threads
     for only, count in ((decomposed, 5), (f"{decomposed}/{composed}/1", 2), (f"*/{composed}/?", 3)):
         path = tmp_path / f"{count}.zarr"
         assert len(sb.run(study, path, threads, only=[only]).computed) == count
-    assert len(chosen_families(sb.open_store(path / composed), composed)) == 1
 
 
 def test_a_part_that_cannot_be_listed_says_why(tmp_path: Path, threads: Client) -> None:

@@ -14,7 +14,7 @@ from sobolev_batch import matrix
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.estimate import PARTS
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.matrix import format_matrix, matrix_frame, pairs_of
+from sobolev_batch.tables.matrix import format_matrix, matrix_frame
 from sobolev_batch.tables.other_orders import distances_at
 from tests.support.trees import tree_of
 
@@ -82,17 +82,8 @@ def test_programs_get_lines_of_pairs() -> None:
 def test_distances_to_the_reference_alone() -> None:
     tree = made(4)
     tree["distances"] = xr.DataTree(tree["distances"].to_dataset().sel(other=["reference"]))
-    assert (len(matrix_frame(distances_at(tree, None), -4.0)), pairs_of(tree, -4.0)) == (5, None)
+    assert len(matrix_frame(distances_at(tree, None), -4.0)) == 5
     assert "\n3 f/2        3.00 ± 0.03\n" in format_matrix(tree, "text", [-4.0])
-
-
-@pytest.mark.parametrize(("most", "kept"), [(10, ["f/0", "f/2", "f/3", "f/4"]), (3, ["f/0", "f/2"])])
-def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference(most: int, kept: list[str]) -> None:
-    found = pairs_of(made(5), -4.0, most=most)
-    assert found is not None
-    assert found["mesh"].values.tolist() == [*kept, "reference"]
-    # They are at 1, 3, 4 and 5, and the reference at zero.
-    assert found["distance"].values[:, -1].tolist() == [*([1.0, 3.0, 4.0, 5.0][: len(kept)]), 0.0]
 
 
 @pytest.mark.parametrize("style", ["text", "markdown", "latex"])

@@ -1,6 +1,6 @@
 """What plots show of a store: orders, families, and the spectra of their meshes."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -12,21 +12,24 @@ import xarray as xr
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.figures.style import Style, style_of
 from sobolev_batch.norms.causes import spectrum
+from sobolev_batch.parameters import as_names
+from sobolev_batch.sources.names import fits, quoted
 from sobolev_batch.tables.convergence import EDGE_LENGTH
 from sobolev_batch.tables.open import (
     AnyStore,
-    Families,
     as_tree,
-    chosen_families,
     complete_meshes,
     families_of,
     finished_group,
     reference_of,
 )
+from sobolev_batch.tables.other_orders import distances_at
 from sobolev_batch.tables.store_accessor import StoreAccessor
 from sobolev_batch.tables.text import spread
 from sobolev_batch.transform.lattice import Orders, check_orders
 
+# Names of families, or globs of names; None is all of them.
+Families = str | Sequence[str] | None
 # A field is read for each mesh; one of 17 MB takes about a quarter of a second.
 MOST_SPECTRA = 24
 _MOST_SAMPLES = 1 << 28
@@ -117,3 +120,35 @@ class Selection:
     def has_spectra(self) -> bool:
         """True if the store has a mesh to compare, of the chosen families."""
         return "similarity" in self.tree.attrs and bool(self.compared)
+
+
+def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
+    """Return the families that names or globs choose, in the study's order; InputError if one fits none of it."""
+    known = list(dict.fromkeys(families_of(tree).values()))
+    if family is None:
+        return known
+    chosen: set[str] = set()
+    for pattern in as_names(family):
+        # A name may have characters that mean something else in a glob.
+        fitting = [pattern] if pattern in known else [name for name in known if fits(name, pattern)]
+        if not fitting:
+            raise InputError(f"the study has no family {quoted(pattern)}, only {', '.join(known)}")
+        chosen.update(fitting)
+    return [name for name in known if name in chosen]
+
+
+def pairs_of(
+    tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
+) -> xr.Dataset | None:
+    """Return `distance` and `error` of one order between the computed meshes, over `mesh` and `other`, symmetric.
+
+    They may be limited to the first ones, or to some labels, and the reference. None without distances of all pairs.
+    """
+    stored = finished_group(tree, "distances", load=False)
+    if stored.sizes["other"] != stored.sizes["mesh"]:
+        return None
+    reference, complete = reference_of(tree), complete_meshes(tree)
+    wanted = {*complete} if among is None else {*among}
+    others = [label for label in complete if label != reference and label in wanted]
+    kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
+    return distances_at(tree, order)[["distance", "error"]].sel(order=order, mesh=kept, other=kept).load()

@@ -23,7 +23,7 @@ from shapely import MultiPoint
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.extras.figures.remade import StudyMeshes, fields_of, matching_labels
-from sobolev_batch.extras.figures.selection import Selection
+from sobolev_batch.extras.figures.selection import Families, Selection, chosen_families
 from sobolev_batch.extras.figures.style import (
     EXTENDS,
     WIDTH_INCHES,
@@ -43,7 +43,7 @@ from sobolev_batch.norms.causes import witness
 from sobolev_batch.parameters import check_choice
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.tables.convergence import table
-from sobolev_batch.tables.open import Families, chosen_families, finished_group
+from sobolev_batch.tables.open import finished_group
 from sobolev_batch.testing.difference import witness_at_vertices
 
 Triangles = NDArray[np.int32]

@@ -11,7 +11,7 @@ from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.norms.columns import NUMBER, VARIABLES, described
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, has_times, reference_of
+from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
 from sobolev_batch.tables.other_orders import convergence_at
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.store_accessor import StoreAccessor
@@ -125,6 +125,11 @@ def format_evolution(
         sections.append(Section(caption, [(table, cells)], moments))
     notes = wrapped(_NOTE.format(factor=factor))
     return rendered(style, frame[["order", "family", "time", *columns]], sections, notes)
+
+
+def has_times(tree: xr.DataTree) -> bool:
+    """Return True if any mesh of the store has a time."""
+    return "time" in finished_group(tree, "meshes", load=False).coords
 
 
 def _moving_meshes(tree: xr.DataTree, truth: str | None) -> pd.DataFrame:

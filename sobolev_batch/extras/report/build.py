@@ -16,7 +16,7 @@ import xarray as xr
 from sobolev_batch.batch.status import status
 from sobolev_batch.errors import InputError, from_extra, write_file
 from sobolev_batch.extras.leagues.costs import CostLeague
-from sobolev_batch.extras.leagues.evolution import evolution
+from sobolev_batch.extras.leagues.evolution import evolution, has_times
 from sobolev_batch.extras.leagues.league import League, percent_text
 from sobolev_batch.parameters import path_of
 from sobolev_batch.shown import together
@@ -24,14 +24,12 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.tables.convergence import is_sequence, label_of, table, with_remarks
-from sobolev_batch.tables.matrix import pairs_of
 from sobolev_batch.tables.open import (
     AnyStore,
     as_tree,
     complete_meshes,
     families_of,
     finished_group,
-    has_times,
     location_of,
     reference_of,
     require_unchanged,
@@ -48,7 +46,7 @@ with from_extra("report", "a report needs"):
     from jinja2.utils import htmlsafe_json_dumps
 
     from sobolev_batch.extras.figures.drawing import MOST_MESHES, clustered_order
-    from sobolev_batch.extras.figures.selection import Selection
+    from sobolev_batch.extras.figures.selection import Selection, pairs_of
     from sobolev_batch.extras.figures.views import Axis, MeshView, make_views
     from sobolev_batch.extras.report.content import PageTable, league_content, study_content
 

@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 
 import sobolev_batch as sb
 from sobolev_batch.extras.figures.drawing import PLOTS, clustered_order, draw_spectrum, write_plots
-from sobolev_batch.extras.figures.selection import Selection
+from sobolev_batch.extras.figures.selection import Selection, chosen_families, pairs_of
 from sobolev_batch.extras.figures.style import Plot, drawing, notes_of, parse_size, set_log_scale, style_of
 from tests.support.commands import finished
 from tests.support.made_tree import root_attributes
@@ -56,6 +56,21 @@ def test_pairs_get_a_heat_map(pairs: xr.DataTree, tmp_path: Path) -> None:
     assert [path.name for path in paths] == ["convergence.png", "matrix.png"]
     alone = sb.plot.matrix(pairs, -10.0, family="_*")
     assert [text.get_text() for text in alone.texts] == ["no two meshes differ"]
+
+
+@pytest.mark.parametrize(("most", "kept"), [(10, ["f/0", "f/2", "f/3"]), (3, ["f/0", "f/2"])])
+def test_pairs_leave_out_failed_meshes_and_keep_the_reference(most: int, kept: list[str]) -> None:
+    places, labels = [1.0, np.nan, 3.0, 4.0, 0.0], ["f/0", "f/1", "f/2", "f/3", "reference"]
+    found = pairs_of(tree_of(places, labels, {-4.0: 1.0}), -4.0, most)
+    assert found is not None
+    assert found["mesh"].values.tolist() == [*kept, "reference"]
+    assert found["distance"].values[:, -1].tolist() == [*([1.0, 3.0, 4.0][: len(kept)]), 0.0]
+
+
+def test_families_are_found_however_their_accents_are_encoded() -> None:
+    composed, decomposed = "caf\u00e9", "cafe\u0301"
+    tree = tree_of([1.0, 0.0], [f"{decomposed}/0", "reference"], {-4.0: 1.0})
+    assert chosen_families(tree, composed) == [decomposed]
 
 
 @pytest.mark.process
