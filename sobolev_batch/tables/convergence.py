@@ -33,7 +33,7 @@ from sobolev_batch.tables.open import (
 )
 from sobolev_batch.tables.other_orders import convergence_at, order_note
 from sobolev_batch.tables.rendering import Column, Section, machine_table, rendered
-from sobolev_batch.tables.results import FROM_COARSE_TO_FINE, rates_in_families
+from sobolev_batch.tables.results import rates_in_families
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
 
@@ -397,8 +397,3 @@ def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
     sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
     # A surface in closed form has none.
     return np.where(sizes > 0, sizes, np.nan)
-
-
-def is_sequence(rows: pd.DataFrame) -> bool:
-    """Return True where the meshes of a family go from coarse to fine, so that a line may join them."""
-    return bool(rows["ordered_by"].isin(FROM_COARSE_TO_FINE).all())

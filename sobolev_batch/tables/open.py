@@ -279,12 +279,6 @@ def reference_of(tree: xr.DataTree) -> str:
     return str(finished_group(tree, "convergence", load=False).attrs["reference"])
 
 
-def families_of(tree: xr.DataTree) -> dict[str, str]:
-    """Return the family of each mesh by its label, in the order of the study."""
-    meshes = finished_group(tree, "meshes", load=False)
-    return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
-
-
 def metadata_of(tree: xr.DataTree) -> list[str]:
     """Return the names of the metadata that the study gives its meshes."""
     return list(finished_group(tree, "meshes", load=False).attrs.get("metadata", ()))

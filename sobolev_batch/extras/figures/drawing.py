@@ -17,7 +17,7 @@ from scipy.spatial.distance import squareform
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.extras.figures.selection import Selection, pairs_of
+from sobolev_batch.extras.figures.selection import Selection, families_of, is_sequence, pairs_of
 from sobolev_batch.extras.figures.style import (
     EXTENDS,
     PictureFormat,
@@ -39,8 +39,8 @@ from sobolev_batch.extras.leagues.costs import CostLeague, objects_text
 from sobolev_batch.extras.leagues.evolution import evolution, has_times
 from sobolev_batch.extras.leagues.league import RELATIVE, League
 from sobolev_batch.shown import few_of
-from sobolev_batch.tables.convergence import is_sequence, label_of, sizes_of, table
-from sobolev_batch.tables.open import complete_meshes, families_of, finished_group, reference_of, study_unit
+from sobolev_batch.tables.convergence import label_of, sizes_of, table
+from sobolev_batch.tables.open import complete_meshes, finished_group, reference_of, study_unit
 
 # More labels along a front would overlap.
 _MOST_LABELS = 20

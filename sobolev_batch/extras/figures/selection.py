@@ -15,15 +15,9 @@ from sobolev_batch.norms.causes import spectrum
 from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import fits, quoted
 from sobolev_batch.tables.convergence import EDGE_LENGTH
-from sobolev_batch.tables.open import (
-    AnyStore,
-    as_tree,
-    complete_meshes,
-    families_of,
-    finished_group,
-    reference_of,
-)
+from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
 from sobolev_batch.tables.other_orders import distances_at
+from sobolev_batch.tables.results import FROM_COARSE_TO_FINE
 from sobolev_batch.tables.store_accessor import StoreAccessor
 from sobolev_batch.tables.text import spread
 from sobolev_batch.transform.lattice import Orders, check_orders
@@ -122,6 +116,12 @@ class Selection:
         return "similarity" in self.tree.attrs and bool(self.compared)
 
 
+def families_of(tree: xr.DataTree) -> dict[str, str]:
+    """Return the family of each mesh by its label, in the order of the study."""
+    meshes = finished_group(tree, "meshes", load=False)
+    return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
+
+
 def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
     """Return the families that names or globs choose, in the study's order; InputError if one fits none of it."""
     known = list(dict.fromkeys(families_of(tree).values()))
@@ -152,3 +152,8 @@ def pairs_of(
     others = [label for label in complete if label != reference and label in wanted]
     kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
     return distances_at(tree, order)[["distance", "error"]].sel(order=order, mesh=kept, other=kept).load()
+
+
+def is_sequence(rows: pd.DataFrame) -> bool:
+    """Return True where the meshes of a family go from coarse to fine, so that a line may join them."""
+    return bool(rows["ordered_by"].isin(FROM_COARSE_TO_FINE).all())

@@ -23,12 +23,11 @@ from sobolev_batch.shown import together
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.tables.convergence import is_sequence, label_of, table, with_remarks
+from sobolev_batch.tables.convergence import label_of, table, with_remarks
 from sobolev_batch.tables.open import (
     AnyStore,
     as_tree,
     complete_meshes,
-    families_of,
     finished_group,
     location_of,
     reference_of,
@@ -46,7 +45,7 @@ with from_extra("report", "a report needs"):
     from jinja2.utils import htmlsafe_json_dumps
 
     from sobolev_batch.extras.figures.drawing import MOST_MESHES, clustered_order
-    from sobolev_batch.extras.figures.selection import Selection, pairs_of
+    from sobolev_batch.extras.figures.selection import Selection, families_of, is_sequence, pairs_of
     from sobolev_batch.extras.figures.views import Axis, MeshView, make_views
     from sobolev_batch.extras.report.content import PageTable, league_content, study_content
 
