@@ -69,7 +69,7 @@ class CheckedStore(WrapperStore[ZarrStore]):
         problem = ""
         # A file may be sparse, and larger than the memory. On object storage this would be one more request.
         if isinstance(self._store, LocalStore):
-            with suppress(FileNotFoundError):
+            with suppress(FileNotFoundError, NotADirectoryError):
                 size, most = await self._store.getsize(key), largest_chunk_bytes(document)
                 problem = f"it has {size} bytes, more than {most}" if size > most else ""
         content = None if problem else await super().get(key, prototype)

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import StorePath
 
-from sobolev_batch.errors import DamageError, ForeignError, StoreError
+from sobolev_batch.errors import DamageError, ForeignError, StoreError, one_line
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
 from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_key, chunks_of, dataset_keys, documents_in
 from sobolev_batch.store.location import Location
@@ -274,7 +274,10 @@ class Store:
         """Return an array, for reading."""
         # The values of fields are compared with their records, which does more.
         path = StorePath(self._keys(name) if name in (FIELD, OCTAVES) else self.checked_keys(name), name)
-        return zarr.Array(zarr.AsyncArray.from_dict(path, self.document(name)))
+        try:
+            return zarr.Array(zarr.AsyncArray.from_dict(path, self.document(name)))
+        except (ValueError, TypeError, KeyError) as error:
+            raise self.damage(name, f"its metadata make no sense: {one_line(error)}") from error
 
     def checked_keys(self, largest: str = FIELD, *, has_tables: bool = False) -> ZarrStore:
         """Return the store that zarr and xarray take to read arrays up to the largest, whose chunks are checked.

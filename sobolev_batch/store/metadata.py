@@ -59,8 +59,9 @@ def consolidated(documents: Mapping[str, Document]) -> Document:
 def attributes_of(root: Document) -> dict[str, Any]:
     """Return the attributes of a root as it is stored, with its mappings; ValueError where one is none."""
     attributes: dict[str, Any] = root.get("attributes", {})
-    texts = {name: attributes[name] for name in _TABLES if isinstance(attributes.get(name), str)}
-    return attributes | {name: mapping_in(text) for name, text in texts.items()}
+    if not isinstance(attributes.get("removed", []), list):
+        raise ValueError(f"the meshes that are removed are {_shown(attributes['removed'])}")
+    return attributes | {name: mapping_in(attributes[name]) for name in _TABLES if name in attributes}
 
 
 def mapping_in(text: str) -> dict[str, Any]:
@@ -109,8 +110,8 @@ def _problem_of_array(node: str, document: Document) -> str:
     if document.get("data_type") not in _DATA_TYPES:
         return f"the data type of {node} is {_shown(document.get('data_type'))}"
     codecs = document.get("codecs")
-    names = [codec.get("name") if isinstance(codec, dict) else codec for codec in codecs] if codecs else [None]
-    for codec in names:
+    for codec in codecs if codecs and isinstance(codecs, list) else [codecs or None]:
+        codec = codec.get("name") if isinstance(codec, dict) else codec
         if codec not in _CODECS:
             return f"the codec of {node} is {_shown(codec)}"
     if document.get("storage_transformers"):
@@ -119,12 +120,13 @@ def _problem_of_array(node: str, document: Document) -> str:
         value = document.get(key)
         if not isinstance(value, dict) or value.get("name") != expected:
             return f"the {key} of {node} is {_shown(value)}"
-    shape, chunk = document.get("shape"), (document["chunk_grid"].get("configuration") or {}).get("chunk_shape")
+    shape, grid = document.get("shape"), document["chunk_grid"].get("configuration")
+    chunk = grid.get("chunk_shape") if isinstance(grid, dict) else grid
     if not _is_shape(shape, 0) or not _is_shape(chunk, 1) or len(shape) != len(chunk):
         return f"{node} has the shape {_shown(shape)} in chunks of {_shown(chunk)}"
     most = math.inf if len(shape) > 1 and _OF_MESHES.fullmatch(node) else _MOST_ELEMENTS.get(len(shape), math.inf)
-    if math.prod(shape) > most or max(shape, default=0) > _LONGEST_AXIS:
-        return f"{node} has the shape {_shown(shape)}"
+    if math.prod(shape) > most or max([*shape, *chunk], default=0) > _LONGEST_AXIS:
+        return f"{node} has the shape {_shown(shape)} in chunks of {_shown(chunk)}"
     return ""
 
 

@@ -222,7 +222,7 @@ def rows_unlike_tables(store: Store, records: Sequence[Record | None]) -> dict[i
     columns = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
     unlike = {}
     for row, status, key in zip(*columns, strict=True):
-        record = records[row] if row < len(records) else None
+        record = records[row] if 0 <= row < len(records) else None
         if record is None and status != "missing":
             unlike[row] = "its completion record is missing"
         elif record is not None and (record.status, record.key) != (status, key):

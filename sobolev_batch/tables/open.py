@@ -82,6 +82,8 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
             tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
             for group in tree.children:
                 tree[group].dataset = with_coordinates(tree[group].to_dataset())
+                if not all(index.is_unique for index in tree[group].indexes.values()):
+                    raise ValueError(f"labels of {group} come twice")
             # The processes of a Dask client do not see the memory of this one.
             for group in () if opened.location.is_in_memory else _LARGE.intersection(tree.children):
                 lazy = xr.open_dataset(keys, group=group, engine="zarr", consolidated=True, zarr_format=3, chunks={})

@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from zarr.storage import MemoryStore
 from sobolev_batch import Study, open_store, plan, run, unlock, verify
 from sobolev_batch.batch.prune import prune
 from sobolev_batch.batch.status import status
-from sobolev_batch.errors import LockError, StoreError
+from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.store import metadata as documents
 from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.encoding import dataset_keys
@@ -174,6 +175,13 @@ NOT_WRITTEN_HERE: list[tuple[str, Document, str]] = [
     ("fourier/mesh", {"codecs": []}, "the codec of fourier/mesh is None"),
     ("fourier/quality", {"data_type": {"name": "object"}}, "the data type of fourier/quality is {'name': 'object'}"),
     ("fourier/xi_x", {"storage_transformers": [{"name": "x"}]}, "has the storage transformers"),
+    ("fourier/xi_x", {"codecs": -1}, "the codec of fourier/xi_x is -1"),
+    ("fourier/xi_x", {"chunk_grid": {"name": "regular", "configuration": "x"}}, "in chunks of 'x'"),
+    (
+        "fourier/xi_x",
+        {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2**63]}}},
+        "in chunks of [9223372036854775808]",
+    ),
     ("fourier/xi_x", {"chunk_grid": {"name": "x"}}, "the chunk_grid of fourier/xi_x is {'name': 'x'}"),
     ("fourier/xi_x", {"chunk_key_encoding": {"name": "v2"}}, "the chunk_key_encoding of fourier/xi_x"),
     ("fourier/xi_x", {"zarr_format": 2, "filters": [{"id": "pickle"}]}, "of zarr format 2"),
@@ -225,6 +233,39 @@ def test_tables_that_this_package_does_not_write_are_made_again_from_the_fields(
     assert run(Study.from_table(small_table()), copy, threads).computed == ()
     assert verify(copy).is_sound
     assert "convergence" in open_store(copy).children
+
+
+def with_a_file_for_a_folder(store: Path) -> None:
+    folder = store / "norms/norm/c/0"
+    shutil.rmtree(folder)
+    folder.write_text("")
+
+
+# What no checksum knows of, and what libraries have errors of their own for.
+SENSELESS: dict[str, Callable[[Path], object]] = {
+    "study": lambda store: change(store, "", lambda root: root["attributes"].update(study=1)),
+    "removed": lambda store: change(store, "", lambda root: root["attributes"].update(removed=2**31)),
+    "codec": lambda store: change(
+        store, "norms/norm", lambda node: node["codecs"][0].update(configuration={"endian": True})
+    ),
+    "dimensions": lambda store: change(store, "norms/norm", lambda node: node.update(dimension_names=["mesh"])),
+    "labels": lambda store: Store.open(store).write("meshes/mesh", [0], ["ico/0"] * 5),
+    "folder": with_a_file_for_a_folder,
+}
+
+
+@pytest.mark.parametrize("name", SENSELESS)
+def test_what_makes_no_sense_is_damage(copy: Path, name: str) -> None:
+    SENSELESS[name](copy)
+    with pytest.raises(DamageError):
+        [group.to_dataset().load() for group in open_store(copy).subtree]
+    with suppress(DamageError):
+        assert not verify(copy).is_sound
+
+
+def test_a_number_of_no_row_is_that_of_a_mesh_without_record(copy: Path) -> None:
+    Store.open(copy).write("meshes/row", [0], [-6, 1, 2, 3, 4])
+    assert not verify(copy).is_sound
 
 
 NAMES = ["..", "../other", "/etc", "a/../../b", "C:\\x", "a\x00b", "fourier//c", "", ".x", "__x", "meshes/zarr.json"]
