@@ -29,7 +29,8 @@ from numpy.typing import ArrayLike
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import StorePath
 
-from sobolev_batch.errors import DamageError, ForeignError, StoreError, one_line
+from sobolev_batch.errors import DamageError, ForeignError, InputError, StoreError, one_line
+from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
 from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_key, chunks_of, dataset_keys, documents_in
 from sobolev_batch.store.location import Location
@@ -179,6 +180,10 @@ class Store:
             raise ForeignError(
                 f"{self.path}: the store of several objects; name that of one, such as {self.path}/{first}"
             )
+        try:
+            Similarity(**({} if has_objects else attributes["similarity"]))
+        except (KeyError, TypeError, InputError) as error:
+            raise self.damage(ROOT, f"its similarity makes no sense: {one_line(error)}") from error
         return attributes
 
     def choice(self) -> LatticeChoice:
@@ -186,7 +191,10 @@ class Store:
         study = self.attributes()["study"]
         dtypes = {"dtype": study["dtype"], "transform_dtype": study["dtype"]}
         given = {**study["lattice"], **dtypes, "closest": (), "reasons": (), "basis": ""}
-        return LatticeChoice.from_dict(study.get("choice") or given, study.get("octaves"))
+        try:
+            return LatticeChoice.from_dict(study.get("choice") or given, study.get("octaves"))
+        except (KeyError, TypeError, InputError) as error:
+            raise self.damage(ROOT, f"its lattice makes no sense: {one_line(error)}") from error
 
     @property
     def is_unfinished(self) -> bool:

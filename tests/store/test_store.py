@@ -245,6 +245,10 @@ def with_a_file_for_a_folder(store: Path) -> None:
 SENSELESS: dict[str, Callable[[Path], object]] = {
     "study": lambda store: change(store, "", lambda root: root["attributes"].update(study=1)),
     "removed": lambda store: change(store, "", lambda root: root["attributes"].update(removed=2**31)),
+    "similarity": lambda store: change(
+        store, "", lambda root: root["attributes"].update(similarity='{"scale": 0, "origin": [0, 0, 0]}')
+    ),
+    "no similarity": lambda store: change(store, "", lambda root: root["attributes"].pop("similarity")),
     "codec": lambda store: change(
         store, "norms/norm", lambda node: node["codecs"][0].update(configuration={"endian": True})
     ),
