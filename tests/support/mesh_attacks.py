@@ -243,6 +243,9 @@ ATTACKS: dict[str, Attack] = {
     "ply, indices with fractions": _file(".ply", ply(BOX_VERTICES, [[0, 1, 2.5]], LITTLE, index="float")),  # type: ignore[list-item]
     # glTF.
     "gltf, deep lists": _file(".gltf", b"[" * 200_000),
+    "gltf, millions of nodes unpacked": _packed(
+        ".gltf", lambda: b'{"asset":{"version":"2.0"},"nodes":[' + b"{}," * (5 * _MEGABYTE // 4) + b"{}]}"
+    ),
     "gltf, many nodes in a row": _file(
         ".gltf", json.dumps({"nodes": [{"children": [i + 1]} for i in range(30_000)]}).encode()
     ),
@@ -333,6 +336,8 @@ ATTACKS: dict[str, Attack] = {
     "3mf, a length that lies": _file(".3mf", lambda: _changed_length(package_3mf(model("") + b" " * 9999))),
     # Medit and Gmsh.
     "medit, a count of many digits": _file(".mesh", b"MeshVersionFormatted 2 Dimension 3 Vertices " + _DIGITS),
+    "medit, comments unpacked": _packed(".mesh", lambda: b"MeshVersionFormatted 2\n" + b"#\n" * 7 * _MEGABYTE),
+    "medit, names unpacked": _packed(".mesh", lambda: b"MeshVersionFormatted 2\n" + b'"a' * 7 * _MEGABYTE),
     "medit, many sections": _file(".mesh", b"MeshVersionFormatted 2 Dimension 3 " + b"Aaa 1 " * 300_000),
     "medit, many cells": _file(".mesh", b"MeshVersionFormatted 2 Dimension 3 Triangles 9e18 Vertices 1e300"),
     "gmsh, blocks that go back": _file(

@@ -10,7 +10,7 @@ import re
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import count, takewhile
+from itertools import count, repeat, takewhile
 from typing import Any
 from urllib.parse import unquote
 
@@ -34,6 +34,10 @@ _HARMLESS = re.compile(
     r"[A-Z]+_(materials|texture|techniques|lights|animation)_.*|KHR_(mesh_quantization|xmp.*)|"
     rf"EXT_(mesh_features|instance_features|structural_metadata)|{_INSTANCING}|{_VISIBILITY}"
 )
+# What places a node within its parent.
+_PLACING = frozenset({"matrix", "translation", "rotation", "scale"})
+# Nodes of large assemblies are hundreds of thousands.
+_MOST_NODES = 1_000_000
 # Vertices (n, 3) and triangles (m, 3).
 _Part = tuple[Reals, Indices]
 # What a part takes at least.
@@ -199,13 +203,15 @@ def _require_second(version: str) -> None:
 def _node_matrices(tree: dict[str, Any]) -> dict[int, Reals]:
     """Return the matrix that places each node of the default scene that is not hidden, by the node's index."""
     nodes = tree.get("nodes", [])
+    if len(nodes) > _MOST_NODES:
+        raise MeshError(f"it has {len(nodes)} nodes, of which {_MOST_NODES} are read; export it with fewer")
     scenes = tree.get("scenes")
     if scenes:
         roots = _entry(tree, "scenes", tree.get("scene", 0)).get("nodes", [])
     else:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [index for index in range(len(nodes)) if index not in children]
-    pending = [(index, np.eye(4)) for index in reversed(roots)]
+    pending = list(zip(reversed(roots), repeat(np.eye(4))))
     found: dict[int, Reals] = {}
     while pending:
         index, parent_matrix = pending.pop()
@@ -214,7 +220,7 @@ def _node_matrices(tree: dict[str, Any]) -> dict[int, Reals]:
         node = _entry(tree, "nodes", index)
         if not node.get("extensions", {}).get(_VISIBILITY, {}).get("visible", True):
             continue
-        found[index] = matrix = parent_matrix @ _matrix(node)
+        found[index] = matrix = parent_matrix if _PLACING.isdisjoint(node) else parent_matrix @ _matrix(node)
         pending += [(child, matrix) for child in reversed(node.get("children", []))]
     return found
 

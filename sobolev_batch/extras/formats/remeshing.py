@@ -28,6 +28,7 @@ _MEDIT_SKIPPED = re.compile(
     "Identifier|Time|AngleOfCornerBound|Iterations|End|(Required|Normal|Tangent|SubDomain|Parallel|[DI]?SolAt)[A-Za-z]*|"
     "[A-Za-z]+OnGeometric[A-Za-z]+"
 )
+_MEDIT_UNREAD = re.compile(rb'(?<!\S)#[^\r\n]*|"[^"\n]*"')
 # How Gmsh's meshes begin: perhaps with comments, then the format, whether it is binary, and how that orders bytes.
 _START = re.compile(
     rb"(?s)\s*(?:\$Comments\s.*?\$EndComments\s+)?\$MeshFormat\s+((?:2(?:\.[0-2])?|4\.1)\s+[01])\s+8[ \t]*\r?\n(.{4})"
@@ -39,8 +40,9 @@ _WITH_AREA, _WITH_VOLUME = (2, 3), (4, 5, 6, 7)
 
 def parse_medit(data: bytes) -> Raw:
     """Return the vertices and triangles of a Medit mesh in text."""
-    # Words begin with a letter and have three or more, unlike numbers. Names stand between quotes.
-    plain = re.sub(rb'(?<!\S)#[^\r\n]*|"[^"\n]*"', b"", data)
+    # Words begin with a letter and have three or more, unlike numbers. Names stand between quotes. Millions of pieces
+    # at once would take a hundred times the bytes of the file.
+    plain = b"".join(_MEDIT_UNREAD.sub(b"", part) for part in re.findall(rb"(?s).{1,65536}[^\n]{0,1048576}", data))
     start, *words = re.split(rb"(?<!\S)(?!(?i:nan|inf|infinity)(?!\S))([A-Za-z][A-Za-z0-9]{2,})", plain)
     names = [word.decode("ascii") for word in words[::2]]
     sections = dict(zip(names, words[1::2], strict=True))
