@@ -37,7 +37,7 @@ _HARMLESS = re.compile(
 # What places a node within its parent.
 _PLACING = frozenset({"matrix", "translation", "rotation", "scale"})
 # Nodes of large assemblies are hundreds of thousands.
-_MOST_NODES = 1_000_000
+_MOST_NODES = 500_000
 # Vertices (n, 3) and triangles (m, 3).
 _Part = tuple[Reals, Indices]
 # What a part takes at least.
