@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from sobolev_batch.arrays import Reals, slices
-from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.mesh import Mesh, cross, dot
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.transform.backends import combine
 
@@ -61,8 +61,8 @@ class FaceNormals:
         squares = self._concentrations(radii, self.sizes[chosen])
         levels = rng.random(len(radii))
         # The distribution of u = |cos θ| is u / √(1 + κ² - κ² u²), which inverts in closed form.
-        cosines = levels * np.sqrt((1 + squares) / (1 + squares * levels**2))
-        sines = np.sqrt(np.maximum(1 - cosines**2, 0.0))
+        spread = 1 + squares * levels**2
+        cosines, sines = levels * np.sqrt((1 + squares) / spread), np.sqrt((1 - levels**2) / spread)
         turns = 2 * np.pi * rng.random(len(radii))
         across = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
         across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -75,7 +75,9 @@ class FaceNormals:
         total, columns = np.zeros(len(radii)), np.ascontiguousarray(directions.T)
         for axis, share, size in zip(self.directions, self.shares, self.sizes, strict=True):
             squares = self._concentrations(radii, size)
-            spread = 1 + squares * np.maximum(1 - combine(axis, columns) ** 2, 0.0)
+            # Of angles below 1e-8, cosines tell nothing.
+            across = np.stack(cross(axis[:, None], columns))
+            spread = 1 + squares * dot(across, across)
             total += share / (4 * np.pi) * (1 + squares) / (spread * np.sqrt(spread))
         return total
 

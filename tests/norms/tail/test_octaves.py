@@ -144,6 +144,14 @@ def test_draws_around_normals_make_flat_faces_quick_to_sample() -> None:
     assert deviations[1] > 3 * deviations[0]
 
 
+def test_spots_that_are_narrower_than_the_rounding_of_cosines_are_met() -> None:
+    octave, turn = Octave(1e9, 1), np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    surface = Mesh(BOX.vertices @ turn, BOX.triangles)
+    normals = FaceNormals.from_surfaces([surface])
+    sums = sums_of(surface, OctaveSampling(octave, (), 4000, 0, normals, 0.3))
+    assert abs(sums.energy - 2 * surface.area) < 3 * sums.energy_deviation < 0.4 * surface.area
+
+
 def test_known_values_are_not_computed_again() -> None:
     sampling = sampling_of(BOX, 0)
     known = values_of(BOX, sampling)
