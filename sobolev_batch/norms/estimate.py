@@ -10,7 +10,7 @@ Without octaves the lattice ends sharply, and the remainder is only bounded (`tr
 lattice holds, and truncation can only add to it. The values m^ themselves are off by the discretisation, whose norm is
 known. By the triangle inequality the norm is off by no more. Of a difference it is the root of both surfaces' squares
 added: the phases between both errors are those between the surfaces, and where these coincide, errors of rules cancel.
-The other three are errors of the square, and change the root by `change_of_root`. All are added: signs are unknown.
+The other three are errors of the square, of which they change the root together (`change_of_root`): signs are unknown.
 
 All that computes a norm or distance calls `estimate_norms`: pairs of surfaces, studies, tables of all pairs, accessors.
 What a distance is relative to, and its parts, follow from the product of the difference with the reference, which is a
@@ -145,9 +145,11 @@ def estimate_norms(
         truncation = np.sqrt(squares + beyond) - values
         return NormEstimate(values, truncation, change_of_root(squares, images), discretisation)
     squares = np.maximum(squares + tail.totals, 0.0)
-    truncation, aliasing, statistical = (
-        change_of_root(squares, error) for error in (tail.remainder_error, images, tail.octaves_error)
-    )
+    # The lower a square already is, the more a further error takes from its root: all of them together change it.
+    changes = np.stack(np.broadcast_arrays(tail.remainder_error, images, tail.octaves_error))
+    total = changes.sum(axis=0)
+    shares = np.divide(changes, total, out=np.zeros_like(changes), where=total > 0)
+    truncation, aliasing, statistical = shares * change_of_root(squares, total)
     return NormEstimate(np.sqrt(squares), truncation, aliasing, discretisation, statistical)
 
 

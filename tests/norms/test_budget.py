@@ -11,7 +11,7 @@ import pytest
 from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.budget import Sums, Support, truncated
-from sobolev_batch.norms.estimate import NormEstimate
+from sobolev_batch.norms.estimate import NormEstimate, Tail, estimate_norms
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.norms.images import NearAxes
 from sobolev_batch.shapes import Sphere, icosphere
@@ -281,3 +281,14 @@ def test_norms_below_their_errors_give_no_relative_error() -> None:
     close = distances.relative_to(norms)
     # The largest quotient that both errors permit.
     assert close[0].item() + close[1].item() == pytest.approx((0.5 + 0.03) / (2.0 - 0.3))
+
+
+def test_errors_of_one_square_change_its_root_together() -> None:
+    lattice = Lattice(2.0, 8)
+    sums = replace(Sums.zeros(1), totals=np.array([0.2]))
+    tail = Tail(*(np.array([part]) for part in (0.3, 0.45, 0.5, 0.45)))
+    found = estimate_norms(
+        sums, SobolevWeights(lattice, (-2.0,), 2.0), Support(np.ones(()), np.ones(13)), np.zeros(1), tail
+    )
+    assert found.values - found.errors == pytest.approx(np.sqrt(1 - 0.9))
+    assert found.truncation == found.statistical
