@@ -30,7 +30,8 @@ _READ_AT_ONCE = 8
 # For fewer rows than this, products do not earn what arranging the samples costs: pairs are taken one by one.
 _FEWEST_ROWS = 4
 # Two surfaces may not have been compared beyond the octaves. Their mean energy there is at least this fraction of the
-# last measured one. It exceeds the sum of both own ones by no more than this multiple of the last distance from it; or
+# last measured one; or less by what that lacks of the sum of both own ones, since close sheets of the little that
+# differs count several times there. It exceeds the sum by no more than this multiple of the last distance from it; or
 # this fraction of it, where the energy has just grown by more than a factor from octave to octave. Below the sum, it is
 # by no more than that multiple of the last excess.
 _LEAST_LIMIT, _SWING, _RISE, _STEEPEST_GROWTH = 0.7, 1.25, 0.9, 2.5
@@ -39,7 +40,7 @@ _HELD_BYTES = 128 << 20
 # Bytes of a sample of octaves: frequency, weight, place, values of three fields with squares, and its move to radii.
 _SAMPLE_BYTES = 400.0
 # What tasks make anew: it is cheaper than sending it.
-_MADE_ANEW = {"weights", "octave_weights", "axis"}
+_MADE_ANEW = {"weights", "octave_weights", "axis", "_from_reference"}
 # A sample of a row takes this much more while its spectra are computed.
 _SPECTRUM_BYTES = 100.0
 
@@ -190,14 +191,14 @@ class Evaluator:
         That of the reference is (1, radii), or None without its field.
         """
         rows, b = list(rows), self.reference
-        tail = self._tail(spectra.norm, lambda row, _: self.qualities[row].own, rows)
+        tail = self._tail(spectra.norm, lambda row, _: self.qualities[row].own.at(self.orders), rows)
         norms = self._estimate_by(spectra.norm, tail, self.areas[rows], self.errors[:, rows])
         zeros, unknown = np.zeros_like(norms.values), np.full_like(norms.values, np.nan)
         beyond = zeros if tail is None else tail.remainder
         if b is None or reference is None:
             nothing = NormEstimate(*[unknown] * 5)
             return Compared(norms, nothing, ReferenceEstimate(nothing, unknown, unknown), (beyond, unknown))
-        of_b = self._tail(reference, lambda row, _: self.qualities[row].own, [b])
+        of_b = self._tail(reference, lambda row, _: self.qualities[row].own.at(self.orders), [b])
         norm_of_b = self._estimate_by(reference, of_b, self.areas[[b]], self.errors[:, [b]])
         of_difference = self._tail(spectra.distance, lambda row, energies: self._remainder(row, b, energies), rows)
         areas, errors = self.areas[rows] + self.areas[b], np.hypot(self.errors[:, rows], self.errors[:, [b]])
@@ -216,13 +217,13 @@ class Evaluator:
         return sums_of_shells(spectra.sums[:, : self.lattice.shell_count], self.weights)
 
     def _tail(
-        self, spectra: Spectra, remainder: Callable[[int, Sequence[float]], Remainder], rows: Sequence[int]
+        self, spectra: Spectra, remainder: Callable[[int, Sequence[float]], tuple[Reals, Reals]], rows: Sequence[int]
     ) -> Tail | None:
         """Return the tails (orders, rows), from spectra and from a function of a row and its energies in octaves."""
         if self.sampling is None:
             return None
         energies = self.axis.energies(spectra)
-        found = [remainder(row, of_row).at(self.orders) for row, of_row in zip(rows, energies, strict=True)]
+        found = [remainder(row, of_row) for row, of_row in zip(rows, energies, strict=True)]
         return Tail(*self.axis.octave_integrals(spectra, self.orders), *np.moveaxis(np.array(found), 0, -1))
 
     def only(self, rows: Iterable[int]) -> Self:
@@ -398,32 +399,47 @@ class Evaluator:
                     if i < j or j >= shared:
                         sums = self.octave_sums(own - values)
                         beyond = self._remainder(rows[i], others[j], [octave.energy for octave in sums])
-                        parts[..., i, j] = astuple(Tail(*integral_over(sums), *beyond.at(self.orders)))
+                        parts[..., i, j] = astuple(Tail(*integral_over(sums), *beyond))
         if shared:
             parts[..., :shared] += np.swapaxes(np.triu(parts[..., :shared], 1), -1, -2)
         return Tail(*parts)
 
-    def _remainder(self, row: int, other: int, measured: Sequence[float]) -> Remainder:
-        """Return what lies beyond the octaves in a distance: known to the reference, else between bounds.
+    @cached_property
+    def _from_reference(self) -> dict[int, tuple[Reals, Reals]]:
+        """What lies beyond the octaves in the squared distance from the study's reference (orders,), by row."""
+        known = {row: quality.difference for row, quality in self.qualities.items()}
+        return {row: difference.at(self.orders) for row, difference in known.items() if difference is not None}
 
-        These follow from the energies in the octaves, which are measured, and those of both surfaces beyond.
+    def _remainder(self, row: int, other: int, measured: Sequence[float]) -> tuple[Reals, Reals]:
+        """Return what lies beyond the octaves in a squared distance (orders,), and how far off it may be.
+
+        It is known to the reference. Else it is between bounds, which follow from the energies in the octaves, which
+        are measured, and those of both surfaces beyond; and, by the triangle inequality, from the known distances.
         """
         for first, second in ((row, other), (other, row)):
-            known = self.qualities[first].difference
-            if second == self.known_reference and known is not None:
-                return known
+            if second == self.known_reference and first in self._from_reference:
+                return self._from_reference[first]
         parts = [self.qualities[number].own for number in (row, other)]
         energies, cutoff = [max(part.energies) for part in parts], parts[0].cutoff
         before, last = ([0.0, *measured])[-2:]
         # Equal meshes have equal values.
         if not last:
-            return Remainder.between(0.0, 0.0, cutoff)
+            return np.zeros(len(self.orders)), np.zeros(len(self.orders))
         # Between parallel surfaces the energy grows like |ξ|², rises through the sum to twice it, and swings about it.
         total = sum(energies)
         least, largest = ((math.sqrt(energies[0]) + sign * math.sqrt(energies[1])) ** 2 for sign in (-1, 1))
         swing = max(_SWING * abs(total - last), _RISE * total if last > _STEEPEST_GROWTH * before else 0.0)
-        lowest = min(_LEAST_LIMIT * last, total, max(total - _SWING * (last - total), least))
-        return Remainder.between(lowest, max(total, min(total + swing, largest)), cutoff)
+        lowest = min(_LEAST_LIMIT * last, 2 * last - total, total, max(total - _SWING * (last - total), least))
+        highest = max(total, min(total + swing, largest))
+        found = Remainder.between(max(lowest, 0.0), highest, cutoff).at(self.orders)
+        if not self._from_reference.keys() >= {row, other}:
+            return found
+        known = found, self._from_reference[row], self._from_reference[other]
+        low, high = (np.maximum([values + sign * errors for values, errors in known], 0.0) for sign in (-1, 1))
+        nearest, farthest = np.sqrt(low[1:]), np.sqrt(high[1:])
+        upper = np.minimum(high[0], farthest.sum(axis=0) ** 2)
+        lower = np.clip(low[0], np.maximum(nearest - farthest[::-1], 0.0).max(axis=0) ** 2, upper)
+        return (lower + upper) / 2, (upper - lower) / 2
 
     def sums_over_shells(self, rows: Sequence[int]) -> Reals:
         """Return the sums of |a|² over shells, see `shell_sums`, of the field of a row or the difference of two."""

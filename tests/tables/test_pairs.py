@@ -105,6 +105,23 @@ def test_a_period_shorter_than_a_unit_is_in_the_errors_of_pairs(
         assert abs(distances[i, j] - surfaces[1].distance(surfaces[2], [order])[0]) < errors[i, j]
 
 
+def test_beyond_octaves_edits_of_one_part_differ_by_no_more_than_both_do_from_it(
+    store_path: Path, threads: Client, tmp_path: Path
+) -> None:
+    part = Rectangles.box((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))
+    plates = (Rectangles.box((x, -0.1, 0.3), (x + 0.1, 0.1, 0.31)) for x in (-0.3, 0.1))
+    surfaces = [part, *map(part.joined, plates)]
+    for k, surface in enumerate(surfaces):
+        write_mesh(surface.mesh(), tmp_path / f"{k}.ply")
+    family = [{"name": "edited", "source": "files", "paths": ["[12].ply"]}]
+    reference, lattice = {"source": "files", "paths": ["0.ply"]}, {"xi_max": 5.0, "M": 32, "octaves": 2}
+    changes = {"family": family, "reference": reference, "lattice": lattice, "scaling": {"mode": "none"}}
+    run(Study.from_table(small_table(norm={"orders": [-1.0]}, **changes), folder=tmp_path), store_path, threads)
+    value, error = (matrix(store_path, -1.0, name).loc["edited/1", "edited/2"] for name in ("distance", "error"))
+    truth = surfaces[1].distance(surfaces[2], [-1.0]).item()
+    assert abs(value - truth) < error < 0.5 * truth
+
+
 def test_new_meshes_cost_new_tiles(store_path: Path, threads: Client, tiles: list[Tile]) -> None:
     run(balls(3), store_path, threads)
     assert sorted(tiles) == [((0, 1), (0, 1)), ((0, 1), (2, 3)), ((2, 3), (2, 3))]
