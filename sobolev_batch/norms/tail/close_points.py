@@ -123,7 +123,7 @@ class Sheets:
         """Area of all surfaces together."""
         return sum(mesh.area for mesh, _ in self.meshes) + sum(sphere.area for sphere, _ in self.spheres)
 
-    @property
+    @cached_property
     def reach(self) -> float:
         """Largest |coordinate|."""
         reaches = [mesh.extent.reach for mesh, _ in self.meshes]
@@ -133,7 +133,7 @@ class Sheets:
         """Yield the triangles of the meshes, not too many at a time."""
         for mesh, sign in self.meshes:
             for part in slices(len(mesh.triangles), _HELD):
-                yield SignedTriangles.with_area(mesh.vertices[mesh.triangles[part]], sign)
+                yield SignedTriangles.with_area(mesh.vertices[mesh.triangles[part]], sign, self.reach)
 
     @cached_property
     def _parts(self) -> list[Mesh | Sphere]:

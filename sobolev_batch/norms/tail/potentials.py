@@ -224,10 +224,11 @@ class SignedTriangles:
     signs: Reals
 
     @classmethod
-    def with_area(cls, corners: Reals, sign: float) -> Self:
-        """Return triangles of one sign, without those that have no area."""
-        doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        corners = corners[doubled > 0]
+    def with_area(cls, corners: Reals, sign: float, largest_coordinate: float = 0.0) -> Self:
+        """Return triangles of one sign, without those that have no area, or are no wider than rounding."""
+        sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        doubled, lengths = np.linalg.norm(np.cross(*sides), axis=1), np.linalg.norm(sides, axis=2).sum(axis=0)
+        corners = corners[doubled > _OF_COORDINATES * largest_coordinate * lengths]
         return cls(corners, np.full(len(corners), float(sign)))
 
     @cached_property

@@ -108,6 +108,13 @@ def test_vertices_that_no_triangle_uses_and_triangles_without_area_do_not_matter
     assert remainder([stray], [1], 60.0, ORDERS).energies == pytest.approx(remainder([BOX], [1], 60.0, ORDERS).energies)
 
 
+def test_slivers_no_wider_than_rounding_do_not_matter() -> None:
+    corners = np.concatenate([BOX.vertices, [[0.1, 0.2, 0.0], [0.1, 0.2, 1e-19], [0.4, 0.2, 0.0]]])
+    more = Mesh(corners, np.concatenate([BOX.triangles, [len(BOX.vertices) + np.arange(3)]]))
+    assert more.areas[-1] > 0
+    assert remainder([more], [1], 60.0, ORDERS).energies == pytest.approx(remainder([BOX], [1], 60.0, ORDERS).energies)
+
+
 def test_a_remainder_survives_the_quality_of_a_field() -> None:
     beyond = remainder([BOX], [1], 60.0, ORDERS, points=100)
     for difference in (beyond, None):
