@@ -127,7 +127,7 @@ class Sheets:
     def reach(self) -> float:
         """Largest |coordinate|."""
         reaches = [mesh.extent.reach for mesh, _ in self.meshes]
-        return max(*reaches, *(sphere.extent.reach for sphere, _ in self.spheres), 0.0)
+        return max([0.0, *reaches, *(sphere.extent.reach for sphere, _ in self.spheres)])
 
     def triangles(self) -> Iterator[SignedTriangles]:
         """Yield the triangles of the meshes, not too many at a time."""
