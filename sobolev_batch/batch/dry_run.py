@@ -273,7 +273,7 @@ def _task_lines(plan: Plan, sizes: Mapping[str, TaskSizes]) -> Iterator[tuple[st
     yield "tasks", f"{tasks} for {len(sizes)} surfaces; chunks of the lattice: {len(plan.blocks)}"
     if plan.study.pairs == "all":
         needed = PAIR_BYTES * len(plan.study.orders) * len(plan.rows) ** 2
-        yield "all pairs", f"{tile_count(len(plan.rows))} tiles, {format_bytes(needed)} on disk"
+        yield "all pairs", f"{format_bytes(needed)} on disk; tiles: {tile_count(len(plan.rows))}"
 
 
 def plan(

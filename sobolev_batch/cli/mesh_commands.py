@@ -99,7 +99,7 @@ _STATUSES = {"same": 0, "within": 0, "different": 1, "not within": 1, "undecided
     "--within",
     metavar="LENGTH",
     help="Tell by the exit status whether no point of either mesh is farther from the other one than LENGTH, such as "
-    "0.1 in the files' unit, or 0.1mm with --unit. A percentage is that of --below.",
+    "0.1 in the files' unit, or 0.1mm with --unit. A percentage means --below.",
 )
 @click.option("--one-way", is_flag=True, help="Of --within, count points of A alone: B may have parts that A lacks.")
 @click.option("--verbose", is_flag=True, help="Also print the parts of each error, and the settings that were chosen.")
@@ -108,8 +108,8 @@ _STATUSES = {"same": 0, "within": 0, "different": 1, "not within": 1, "undecided
 def compare_command(context: click.Context, /, **options: Any) -> None:
     """Print how much two meshes differ.
 
-    B is the reference. The difference is given in per cent of its norm, with a bound on the error, with the share
-    of the squared distance that a change of area explains, and with the move of B that takes it as far from itself.
+    B is the reference. The difference is given in per cent of its norm, with an estimate of the largest error, the
+    share of the squared distance that a change of area explains, and the move of B that takes it as far from itself.
 
     Two options print one line instead: --below on whether both are the same surface, and --within on whether they are
     as near everywhere as a length. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be
@@ -240,7 +240,7 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
     metavar="TOLERANCE",
     help="Keep the largest deviation within a length, such as 0.1mm, or the distance within 1% of the norm.",
 )
-@click.option("--order", type=float, help=f"Measure this fraction at an order below -1/2. [default: {DEFAULT_ORDER:g}]")
+@click.option("--order", type=float, help=f"Measure percentages at this order below -1/2. [default: {DEFAULT_ORDER:g}]")
 @click.option(
     "--measure", metavar="COLUMN", help="Keep rms, mean, area or another column within TOLERANCE, or fscore above."
 )
@@ -250,7 +250,7 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
     default="decimate",
     show_default=True,
     metavar="METHOD",
-    help="Take 'mmgs_O3 -in {input} -out {output} -hausd {hausd}' or another command, or the source remesh.",
+    help="Make meshes by 'mmgs_O3 -in {input} -out {output} -hausd {hausd}' or another command, or by remesh.",
 )
 @click.option(
     "--search",
@@ -280,8 +280,8 @@ def reduce_command(
     tolerance is known. Bounds decide, or samples with their errors. The same command goes on where it was ended. A
     command in METHOD runs in a folder of its own, here or on the workers; {folder} in it is the current one.
 
-    The exit status is 3 if nothing within the tolerance was found for some. The original itself is something: where no
-    smaller mesh held, it is what is written, and a note says so.
+    Where no smaller mesh is within the tolerance, the original is written, and a note says so. The exit status is 3 if
+    nothing was found for some mesh.
     """
     from sobolev_batch.batch.reduce import format_reductions, reduce
 

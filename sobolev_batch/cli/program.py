@@ -123,11 +123,11 @@ def cli(context: click.Context, debug: bool) -> None:
     """Sobolev distances of negative order between surface meshes.
 
     A study file names families of meshes and a reference. `run` stores the Fourier transform of every
-    mesh and prints its distance from the reference.
+    mesh and prints which are nearest to the reference.
 
     The exit status is 0 if all is done, 2 if the input is wrong, 3 if some meshes failed or are missing, 5 if a disk
-    is full, 1 after another error, 130 after Ctrl-C and 143 after SIGTERM. `compare --below` and `compare --within`
-    have their own.
+    is full, 1 after another error or a check that failed, 130 after Ctrl-C and 143 after SIGTERM. `compare --below`
+    and `compare --within` have their own.
     """
     _set_up_logging(debug)
     command = cli.get_command(context, str(context.invoked_subcommand))

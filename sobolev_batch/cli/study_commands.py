@@ -164,8 +164,8 @@ def plan_command(
     """Show what running STUDY would do.
 
     No field is computed, but a lattice for an [accuracy] is chosen, for which a few meshes are made and compared. The
-    plan has the lattice and the reasons for it, the tasks and their memory, the bytes to be stored, and the number of
-    surfaces that the store has already.
+    plan has the time, the tasks and their memory, the bytes to be stored, the number of surfaces that the store has
+    already, and the lattice with the reasons for it.
     """
     from sobolev_batch.batch.dry_run import plan
 

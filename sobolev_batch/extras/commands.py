@@ -85,9 +85,9 @@ def _output_option(text: str, default: str) -> Callable[[Callback], Callback]:
 def init_command(folder: Path, output: Path) -> None:
     """Write a study file for the meshes in FOLDER.
 
-    It runs as it is, and says what to change. The reference is the mesh that is called original, reference, target or
-    ground truth, or else the one with the most triangles. Folders are families, and so are meshes whose names differ
-    in the number at the end. Several references are several objects. [default: current folder]
+    The study runs as it is. The reference is the mesh that is called original, reference, target or ground truth, or
+    else the one with the most triangles. Folders are families, and so are meshes whose names differ in the number at
+    the end. Several references are several objects. Without FOLDER, the current one is taken.
     """
     from sobolev_batch.extras.draft import init_study
 
@@ -251,7 +251,7 @@ def plot_command(
     They show convergence, distances and spectra, and some of the meshes. Those of several objects show their league.
 
     Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt
-    from the study. Pictures need the extra "plot". By default a few are chosen by their distances.
+    from the study, by default a few, chosen by their distances. Pictures need the extra "plot".
     """
     from sobolev_batch.extras.leagues.league import league
     from sobolev_batch.store.objects import Objects
@@ -362,7 +362,7 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis | None,
     """Write the results of STORE as one HTML page.
 
     The page needs no other files and makes no requests. What it leaves out is listed. The page of several objects
-    has their league; STORE/OBJECT is the store of each, which has a page of its own.
+    has their league; STORE/OBJECT is the store of each, which has a page of its own. Pages need the extra "report".
     """
     from sobolev_batch.extras.report.build import make_report
 
@@ -419,7 +419,7 @@ def time_command(store: Location, style: Format, orders: ChosenOrders, truth: st
     help="Compare with this earlier study instead; families within tolerances need --y triangles.",
 )
 @click.option(
-    "--most", type=click.FloatRange(min=1.0), metavar="RATIO", help="A mean ratio to the earlier study above it fails."
+    "--most", type=click.FloatRange(min=1.0), metavar="RATIO", help="Fail if a mean ratio to that study is above it."
 )
 def league_command(
     store: Location,

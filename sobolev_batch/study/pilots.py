@@ -245,7 +245,7 @@ def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapp
     ]
     if tail.octaves:
         reasons.append(
-            f"{len(tail.octaves)} octaves up to |xi| {tail.highest_frequency:.4g} for the tail, from the closest of "
+            f"octaves up to |xi| {tail.highest_frequency:.4g} for the tail ({len(tail.octaves)}), from the closest of "
             f"{len(problems)} pilot pairs: {', '.join(lattices)}"
         )
     return _choice(lattice, dtype, dtypes, closest, reasons, first, tail if tail.octaves else None), shortfalls

@@ -145,7 +145,7 @@ def test_workers_of_a_cluster_are_tried(client: Client, plan: Plan) -> None:
     first, second, *_ = str(found).splitlines()
     assert re.fullmatch(r"time: +about \d+(\.\d+)? s for 5 missing fields, with 2 tasks at once", first)
     assert second.endswith("the speed is that of a transform on a worker")
-    assert "1 tiles, 2.4KB on disk" in str(found)
+    assert "2.4KB on disk; tiles: 1" in str(found)
 
 
 def test_of_many_objects_some_are_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
