@@ -47,7 +47,7 @@ test-servers: $(READY)  ## the recipes on SLURM (slurm-wlm and munge of Debian) 
 durations: $(READY)  ## run the tests and record the seconds of each file in tests/durations.tsv
 	$(PYTEST) -n 3 -m "not all" --record-durations
 
-coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs of 32 kinds; a quarter of an hour
+coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs of 33 kinds; a quarter of an hour
 	$(BIN)/python -m tests.coverage
 
 soak: $(READY)  ## 2,000 meshes while processes are killed and the storage fails, 30 struck clusters, 1,000 damaged files, 510 mixed states; three hours
