@@ -217,9 +217,9 @@ class _Runs:
 
     def begun(self) -> Iterator[tuple[str, Stages[Ended]]]:
         """Yield the runs of objects of which anything may be missing."""
-        objects, whole = self.objects, frozenset[str]()
+        objects, root, whole = self.objects, self.objects.root, frozenset[str]()
         # A run of a part may have left the others no more than its own orders.
-        if objects.tabulated_orders == self.study.orders:
+        if "convergence" in root.documents and tuple(root.read("convergence/order").tolist()) == self.study.orders:
             whole = self.place.names().intersection(objects.tabulated)
         for name in self.study.objects:
             one, record = self.study.of_object(name), self.recorded.get(name)

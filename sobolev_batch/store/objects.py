@@ -68,11 +68,6 @@ class Objects:
         """Return the names of the objects that have rows in the tables at the root, as keys in the order of these."""
         return dict.fromkeys(self.root.read_strings("meshes/object") if "meshes" in self.root.documents else ())
 
-    @property
-    def tabulated_orders(self) -> tuple[float, ...]:
-        """Return the orders of the numbers in the tables at the root; none before there are tables."""
-        return tuple(self.root.read("convergence/order").tolist()) if "convergence" in self.root.documents else ()
-
     def existing_store(self, name: str) -> Location | None:
         """Return the store of an object, None before its reference was made; DamageError if it is lost or another."""
         try:

@@ -201,13 +201,8 @@ def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[Ta
         yield {**_absent("missing", few_of(list(failed))), "reasons": "failed"}
 
 
-def totals_of(rows: pd.DataFrame) -> dict[str, int]:
-    """Return how many rows of `table` have a distance, how many lack one, and how many have one above rtol."""
-    return {name: int(number) for name, number in _counted(rows).sum().items()}
-
-
-def _counted(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns `_TOTALS` of rows, which tell what each counts as."""
+def counted(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return whether each row of `table` has a distance, lacks one, and has one above rtol; their sums are totals."""
     known = rows["distance"].notna()
     return pd.DataFrame(dict(zip(_TOTALS, (known, ~known, _is_above_rtol(rows)), strict=True)))
 
@@ -259,7 +254,7 @@ def format_objects(
     rows = pd.concat({name: frame[_OF_OBJECTS] for name, frame in frames.items()}, names=["object"])
     rows = rows.reset_index("object").reset_index(drop=True)
     keys = ["order", "object"]
-    totals = rows[keys].join(_counted(rows)).groupby(keys, sort=False).sum()
+    totals = rows[keys].join(counted(rows)).groupby(keys, sort=False).sum()
     known = rows[rows["relative"].notna()]
     nearest = known.loc[known.groupby(keys)["relative"].idxmin()].set_index(keys)
     frame = totals.join(nearest[["mesh", "relative", "relative_error"]]).fillna({"mesh": ""}).reset_index()

@@ -31,7 +31,7 @@ from sobolev_batch.extras.leagues.league import (
     pair_lines,
 )
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, TableRow, study_verdict, totals_of
+from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, TableRow, counted, study_verdict
 from sobolev_batch.tables.convergence import (
     CONNECTION_COLUMNS,
     MESH,
@@ -261,7 +261,7 @@ def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: Leagu
     """Yield the objects with their best methods at one order."""
     places = {} if league is None else {name: place for place, name in enumerate(league.objects)}
     for name, frame in tables.items():
-        row = {"order": order, "object": name, **totals_of(frame[frame["order"] == order])}
+        row = {"order": order, "object": name, **counted(frame[frame["order"] == order]).sum().to_dict()}
         if league is None or name not in places:
             reason = league.left_out.get(name, "no distances") if league else "methods cannot be compared"
             yield {**row, "absent": f"left out: {reason}"}
