@@ -89,9 +89,8 @@ class Limit:
         if units in unit_of:
             if is_relative:
                 kind = "an angle in degrees" if units == ANGLE else "a length"
-                raise InputError(
-                    f"{column} is {kind}, found {within!r}; percentages are for the distance, area and volume"
-                )
+                others = ", ".join((RELATIVE, *_OF_ONE_MESH, *_SCORES))
+                raise InputError(f"{column} is {kind}, found {within!r}; percentages are for {others}")
             text = str(within).replace("°", ANGLE) if units == ANGLE else within
             return cls(length_in(text, unit_of[units]), column)
         value, whole = math.inf, "norm" if column == RELATIVE else column

@@ -510,7 +510,7 @@ def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path)
         ({"within": 1.0, "measure": "smallest_angle"}, "smallest_angle cannot be a limit"),
         ({"within": 1.0, "measure": "fscore"}, "a fraction of the fscore below 1"),
         ({"within": 1.0, "measure": 3}, "no measure is named '3'; known are"),
-        ({"within": "1%", "measure": "rms"}, "rms is a length"),
+        ({"within": "1%", "measure": "rms"}, "rms is a length, .* are for relative, area, volume, fscore, precision"),
         ({"within": "1%", "measure": "area", "order": -2.0}, "area has no order"),
         ({"within": "1 mm", "measure": "area"}, "a fraction of the area below 1, such as 1%, found '1 mm'"),
         ({"within": "1 mm", "measure": "normal_mean"}, "'1 mm' cannot be converted into 'degree'"),
