@@ -242,7 +242,7 @@ def test_compare_names_units_and_defects(folder: Path) -> None:
         assert "inverted.off: all triangles face inwards\n" in shown
         assert shown.count("inverted.off: components that lie inside others: 1\n") == 1
         assert "part.off: components" not in shown
-    assert "distances of orders are in radii of inverted.off, 100 mm each" in scaled
+    assert "Sobolev distances are in radii of inverted.off, 100 mm each" in scaled
     assert "wavelengths above 1 mm" not in scaled
     assert "wavelengths above 1 mm weigh alike" in kept
     assert "in mm; the radius of inverted.off is 100\n" in kept

@@ -323,9 +323,9 @@ class Comparison:
             yield _settings_text(self.results.attrs)
         radius, origin = self.second.bounding_sphere[1], " ".join(f"{x:.6g}" for x in self.similarity.origin)
         yield (
-            f"distances of orders are in {self.unit}; the radius of {self.options.names[1]} is {radius:.6g}"
+            f"Sobolev distances are in {self.unit}; the radius of {self.options.names[1]} is {radius:.6g}"
             if self.options.no_scaling
-            else f"distances of orders are in radii of {self.options.names[1]}, {radius:.6g} {self.unit} each "
+            else f"Sobolev distances are in radii of {self.options.names[1]}, {radius:.6g} {self.unit} each "
             f"(scale {self.similarity.scale:.6g}, origin {origin})"
         )
 

@@ -78,7 +78,7 @@ rate. The column "area" is the share of the squared distance that a change of to
 alone explains."""
 _UNIT_NOTE = """\
 Edges and other lengths are in {}.
-Distances of orders are computed in {}."""
+Sobolev distances are computed in {}."""
 _PROXIMITY_NOTE = """\
 Other distances are the same at all orders. They are those of points to the other mesh, the
 larger of both directions. The Hausdorff distance is between the bounds; other numbers are
@@ -318,7 +318,7 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
 
 
 def _metrics_of(tree: xr.DataTree) -> list[str]:
-    """Return the names of the numbers, besides distances of orders, that the study shows in its tables."""
+    """Return the names of the numbers, besides Sobolev distances, that the study shows in its tables."""
     metrics = finished_group(tree, "proximity").attrs["metrics"] if "proximity" in tree.children else []
     return [name for metric in metrics for name in METRICS.get(metric, ())]
 
