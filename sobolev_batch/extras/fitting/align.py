@@ -24,6 +24,8 @@ _STAGES = ((0.6, 1000, 6, 12), (1.4, 4000, 2, 12), (4.0, 10**9, 1, 25))
 _SPACING, _EPS = 0.2, 1e-6
 # A mesh whose center is farther from the other one, in radii, begins there: a period away nothing would draw it in.
 _IN_PLACE = 1.0
+# A motion that leaves more than this of the squared distance is none: of a mesh with symmetries, many are as good.
+_NO_GAIN = 0.98
 # Steps shorter than this, in radii, end a stage; a step is damped by at most this much.
 _SHORTEST, _MOST_DAMPED = 1e-7, 1e6
 
@@ -31,9 +33,10 @@ _SHORTEST, _MOST_DAMPED = 1e-7, 1e6
 def align(a: MeshLike, b: MeshLike, *, order: float = -2.0) -> Reals:
     """Return the rigid motion of a mesh that makes its Sobolev distance from another one as small as it was found.
 
-    The search starts from the mesh as it is, unless that is elsewhere, and around the center of b from 24 rotations by
-    right angles, and from those that match principal axes. It compares long wavelengths first. A mesh with symmetries
-    has several best motions. Reflections and changes of size are no rigid motions.
+    It is none where no motion found lowers the distance by a hundredth. The search starts from the mesh as it is,
+    unless that is elsewhere, and around the center of b from 24 rotations by right angles, and from those that match
+    principal axes. It compares long wavelengths first. A mesh with symmetries has several best motions. Reflections and
+    changes of size are no rigid motions.
 
     Args:
         a: Mesh to move, or what `as_mesh` makes one of.
@@ -70,7 +73,9 @@ def align(a: MeshLike, b: MeshLike, *, order: float = -2.0) -> Reals:
         stage = _Stage(lattice, order, _nodes(own, lattice, points), _nodes(target, lattice, points))
         scored = sorted((stage.lowered(turn, shift, steps) for _, turn, shift in scored), key=lambda found: found[0])
         scored = scored[:kept]
-    _, turn, shift = scored[0]
+    square, turn, shift = scored[0]
+    if starts[0][1] is as_is and square >= _NO_GAIN * stage.expansion(*starts[0])[0]:
+        return np.eye(4)
     matrix = np.eye(4)
     matrix[:3, :3] = turn
     matrix[:3, 3] = centers[1] + radius * shift - turn @ centers[0]
@@ -90,12 +95,12 @@ class _Stage:
     def lowered(self, turn: Reals, shift: Reals, steps: int) -> tuple[float, Reals, Reals]:
         """Return the squared distance, rotation and shift after steps of Levenberg and Marquardt."""
         damping = 1e-3
-        square, gradient, curvature = self._expansion(turn, shift)
+        square, gradient, curvature = self.expansion(turn, shift)
         for _ in range(steps):
             step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature) + 1e-30), -gradient)
             # A step in the rotation is a small one after it.
             trial = Rotation.from_rotvec(step[:3]).as_matrix() @ turn, shift + step[3:]
-            found = self._expansion(*trial)
+            found = self.expansion(*trial)
             if found[0] < square:
                 (turn, shift), (square, gradient, curvature) = trial, found
                 damping /= 5
@@ -105,7 +110,7 @@ class _Stage:
                 break
         return square, turn, shift
 
-    def _expansion(self, turn: Reals, shift: Reals) -> tuple[float, Reals, Reals]:
+    def expansion(self, turn: Reals, shift: Reals) -> tuple[float, Reals, Reals]:
         """Return the squared distance, half its gradient (6,) and the matrix (6, 6) of Gauss and Newton."""
         turned = turn @ self.own.coordinates
         places, weights = turned + shift[:, None], self.own.weights

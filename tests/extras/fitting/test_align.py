@@ -46,6 +46,17 @@ def test_a_motion_is_undone(degrees: float, level: int) -> None:
 
 
 @pytest.mark.slow
+def test_a_mesh_with_symmetries_stays_where_it_is() -> None:
+    coarse, fine = (sb.shapes.Torus().mesh(*cells) for cells in ((20, 10), (34, 18)))
+    assert np.array_equal(sb.fitting.align(coarse, fine), np.eye(4))
+    elsewhere = np.eye(4)
+    elsewhere[:3, 3] = 0.3, 0.0, 0.1
+    back = sb.fitting.align(moved_by(coarse, elsewhere), fine)
+    center = coarse.vertices.mean(axis=0)
+    assert back[:3, :3] @ (center + elsewhere[:3, 3]) + back[:3, 3] == pytest.approx(center, abs=1e-3)
+
+
+@pytest.mark.slow
 def test_a_mirror_image_stays_one() -> None:
     target = shape(3)
     mirrored = sb.Mesh(target.vertices * [1, 1, -1], target.triangles[:, ::-1])
