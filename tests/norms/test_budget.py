@@ -292,3 +292,13 @@ def test_errors_of_one_square_change_its_root_together() -> None:
     )
     assert found.values - found.errors == pytest.approx(np.sqrt(1 - 0.9))
     assert found.truncation == found.statistical
+
+
+def test_points_of_a_distance_tell_the_share_of_area_too() -> None:
+    box, order = Rectangles.box((-0.5, -0.35, -0.25), (0.5, 0.35, 0.25)), -2.0
+    moved, nothing = box.moved(0.003, 0.002, 0.001), Rectangles(np.zeros((0, 3)), np.zeros((0, 3)))
+    found = distance(moved.mesh(), box.mesh(), order, rtol=1e-2)
+    square, own = (box.squared_distance(other, [order])[0].item() for other in (moved, nothing))
+    # Of a mere move, the product with the surface is minus half of the squared distance.
+    truth = square / (4 * own)
+    assert abs(found["area_share"].item() - truth) < found["area_share_error"].item() < 0.4 * truth

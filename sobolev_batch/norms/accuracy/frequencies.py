@@ -16,7 +16,7 @@ from sobolev_batch.norms.budget import Sums, Support, sums_of_shells
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, Tail, estimate_norms
 from sobolev_batch.norms.fields import field_for
 from sobolev_batch.norms.tail.integrals import OctaveWeights, integral_over, squared_moduli
-from sobolev_batch.norms.tail.remainder import mean_sinc, remainder
+from sobolev_batch.norms.tail.remainder import Remainder, mean_sinc, remainder
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.norms.tail.values import octave_values
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, cheapest_dtype
@@ -128,13 +128,18 @@ class Frequencies:
         octaves = zip(self._octave_weights, measure.octaves, other.octaves, strict=True)
         return integral_over([weights.sums((a.astype(np.complex128) * b.conj()).real) for weights, a, b in octaves])
 
-    def tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail | None:
+    def tail(
+        self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int], beyond: Remainder | None = None
+    ) -> Tail | None:
         """Return the tail from the octaves and what is known to lie beyond them; None where the lattice is all."""
         if not self.has_tail:
             return None
-        # Norms of single surfaces serve as scales.
-        beyond = remainder(surfaces, signs, self._cutoff, self.orders, is_scale=len(surfaces) == 1)
+        beyond = beyond or self._beyond(surfaces, signs)
         return Tail(*self.octave_integral(measure, measure), *beyond.at(self.orders))
+
+    def _beyond(self, surfaces: Sequence[Surface], signs: Sequence[int]) -> Remainder:
+        # Norms of single surfaces serve as scales.
+        return remainder(surfaces, signs, self._cutoff, self.orders, is_scale=len(surfaces) == 1)
 
     def against(
         self,
@@ -152,10 +157,17 @@ class Frequencies:
         """
         a_minus_b, b = Measure.from_values(difference, signs), Measure.from_values([reference], [1])
         a = Measure.from_values([*difference, reference], [*signs, 1])
-        tails = self.tail(a, pair[:1], [1]), self.tail(b, pair[1:], [1]), self.tail(a_minus_b, surfaces, signs)
+        beyond = self._beyond(surfaces, signs) if self.has_tail else None
+        of_difference = self.tail(a_minus_b, surfaces, signs, beyond)
+        tails = self.tail(a, pair[:1], [1]), self.tail(b, pair[1:], [1]), of_difference
         norms = self.norms_of(b, pair[1:], self.errors([reference]), tails[1])
         distances = self.norms_of(a_minus_b, surfaces, self.errors(difference) + moved, tails[2])
         products, tail = self.lattice_sums(a_minus_b, b), Tail.of_product(self.octave_integral(a_minus_b, b), *tails)
+        if beyond is not None and tail is not None and surfaces is pair:
+            # Of whole surfaces the points of the distance show the product too.
+            values, errors = beyond.products_at(self.orders)
+            values = np.where(errors < tail.remainder_error, values, tail.remainder)
+            tail = replace(tail, remainder=values, remainder_error=np.minimum(errors, tail.remainder_error))
         return ReferenceEstimate.from_products(products, self.weights, self.widths, distances, norms, tail)
 
 

@@ -94,6 +94,7 @@ class Remainder:
         pairs: Number of pairs of a point and a triangle.
         covering: Number of points from which no part of a surface is hidden.
         hidden: Largest share of the squared errors that allows for what too few points may have missed.
+        excesses: The energies of the product of a difference a - b with a + b, and how far off they may be.
     """
 
     cutoff: float
@@ -104,6 +105,7 @@ class Remainder:
     pairs: int = 0
     covering: int = 0
     hidden: float = 0.0
+    excesses: tuple[tuple[float, ...], ...] = ((), ())
 
     @classmethod
     def between(cls, lowest: float, highest: float, cutoff: float) -> Self:
@@ -131,6 +133,18 @@ class Remainder:
             if order < known:
                 errors[number] += values[number] / 2
                 values[number] /= 2
+        return values, errors
+
+    def products_at(self, orders: Sequence[float]) -> tuple[Reals, Reals]:
+        """Return the part of the product of a difference a - b with b (orders,), and how far off it may be.
+
+        It is half of what the excess differs by from the squared norm. It is known at the own orders alone.
+        """
+        values, errors = np.zeros(len(orders)), np.full(len(orders), np.inf)
+        for number, (order, excess, error) in enumerate(zip(self.orders, *self.excesses, strict=False)):
+            here, scale = np.equal(orders, order), tail_integral(self.cutoff, order) / 2
+            values[here] = scale * (excess - self.energies[number])
+            errors[here] = scale * (error + self.errors[number])
         return values, errors
 
     def bounds(self, orders: Sequence[float]) -> Reals:
@@ -210,7 +224,8 @@ def remainder_between(
     """Estimate what lies beyond a cutoff in the distance of two surfaces; see `remainder`."""
     # Only what they do not have in common counts.
     if rests := without_common_parts(pair):
-        return remainder(list(rests.values()), list(rests), cutoff, orders, execution=execution, is_bound=is_bound)
+        found = remainder(list(rests.values()), list(rests), cutoff, orders, execution=execution, is_bound=is_bound)
+        return replace(found, excesses=((), ()))
     return Remainder.between(0.0, 0.0, cutoff)
 
 
@@ -243,6 +258,8 @@ def _estimate(
     scale = seen_by.sheets.area * seen_by.alone
     # A move changes what tables leave in proportion to itself, and smooth kernels in proportion to its square.
     cut, left = _CUT * found.share * scale, _CUT_LEFT * np.sqrt(found.share) * scale
+    excesses, scatter = _excesses(found.draw, found.potentials)
+    excess_errors = np.sqrt(scatter + missed) * quantile(n - 1) + cut + left
     # A bound is little more where the cut is little of all.
     if is_exact and np.any(cut > _CUT_FRACTION * (errors + (np.abs(means) if is_bound else 0.0))):
         corrections, cut = seen_by.corrections(found.draw, found.potentials, rng)
@@ -252,8 +269,23 @@ def _estimate(
     means, left = means * (1 + lacking / seen_by.sheets.area), left + abs(lacking) * seen_by.alone
     kernels = seen_by.kernels
     scales = np.array([tail_integral(kernels.cutoff, order) for order in kernels.orders])
-    energies, errors = (tuple(values.tolist()) for values in (means / scales, (errors + cut + left) / scales))
-    return Remainder(kernels.cutoff, kernels.orders, energies, errors, found.total, found.pairs, covering, hidden)
+    several = means, errors + cut + left, excesses, excess_errors
+    energies, errors, *of_excess = (tuple((values / scales).tolist()) for values in several)
+    known = kernels.cutoff, kernels.orders, energies, errors, found.total, found.pairs, covering, hidden
+    return Remainder(*known, tuple(of_excess)) if seen_by.sheets.cancel else Remainder(*known)
+
+
+def _excesses(draw: Draw, potentials: Reals) -> tuple[Reals, Reals]:
+    """Return the product of a difference with the sum of both surfaces (orders,), and its variance.
+
+    How many points lie on each surface is no chance.
+    """
+    parts = np.abs(draw.weights)[..., None] * potentials
+    groups = [parts.sum(axis=0)] if len(parts) > 1 else [parts[0][draw.weights[0] * sign > 0] for sign in (1, -1)]
+    groups = [group for group in groups if len(group) > 1]
+    offs = [group - group.mean(axis=0) for group in groups]
+    variances = sum(len(off) * off.var(axis=0, ddof=1) + np.abs(off).max(axis=0) ** 2 for off in offs)
+    return np.sum([group.sum(axis=0) for group in groups], axis=0), np.asarray(variances)
 
 
 class _Found(NamedTuple):
