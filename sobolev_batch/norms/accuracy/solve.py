@@ -25,7 +25,7 @@ from sobolev_batch.norms.accuracy.tolerance import (
     refined,
 )
 from sobolev_batch.norms.bounds import modulus_bound
-from sobolev_batch.norms.budget import Sums, Support
+from sobolev_batch.norms.budget import Sums
 from sobolev_batch.norms.estimate import NormEstimate, estimate_norms
 from sobolev_batch.norms.fields import Field
 from sobolev_batch.norms.tail.face_normals import FaceNormals
@@ -255,7 +255,9 @@ def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool
         return with_part(certain), None
     if np.all(np.isfinite(certain)):
         farther, quick = needed(certain, permitted(_NEGLIGIBLE), powers - 2), min(_quick_intervals(problem), largest)
-        sparse = _sparse_lattice(problem.support, farther)
+        # The largest spacing on which surfaces fit and no peak is missed: squares have twice the bandwidth.
+        room = max(2 * float(problem.support.widths.max()), LEAST_CLEARANCE * 2 * problem.support.reach)
+        sparse = lattice_of(farther, room, LARGEST_M)
         if quick >= sparse.M:
             bound = _bound_up_to(problem, lattice, sparse, permitted(_OF_VALUES))
             bound += modulus_bound(problem.area, orders, sparse.xi_max)
@@ -272,13 +274,6 @@ def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool
         largest = min(_WIDE_M, largest)
     farther = needed(bound, permitted(0.5), powers)
     return with_part(bound), lattice_of(farther, period, largest) if 2 * farther * period <= largest else None
-
-
-def _sparse_lattice(support: Support, highest: float) -> Lattice:
-    """Return the lattice of the largest spacing on which surfaces fit and no peak of their transforms is missed."""
-    # A square of a transform has twice the bandwidth of the transform.
-    period = max(2 * float(support.widths.max()), LEAST_CLEARANCE * 2 * support.reach)
-    return lattice_of(highest, period, LARGEST_M)
 
 
 def _bound_up_to(problem: Problem, lattice: Lattice, sparse: Lattice, squared_errors: Reals) -> Reals:
