@@ -388,6 +388,13 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     # An error that nothing bounds leaves the interval open.
     changes = sb.compare_studies({"a": more}, one, -3).set_index("method")
     assert changes.loc["ico", ["low", "high"]].tolist() == [0.0, np.inf]
+    # An object that both studies reproduce up to rounding has not changed, and hides no change of others.
+    tiny = {"relative": 0 * known + 1e-6, "relative_error": 0 * known.fillna(0) + 1e-5}
+    cube, grown = sb.open_store(store / "b").load(), sb.open_store(store / "a").load()
+    cube["convergence"] = xr.DataTree(cube["convergence"].to_dataset().assign(tiny))
+    grown["convergence"] = xr.DataTree(convergence.assign(relative=2 * convergence["relative"]))
+    changes = sb.compare_studies({"a": grown, "b": cube}, {"a": store / "a", "b": cube}, -3).set_index("method")
+    assert np.isfinite(changes.loc["egg", ["low", "high"]].astype(float)).all()
     more["convergence"] = xr.DataTree(convergence.where(convergence["mesh"] != "ico/1"))
     assert sb.compare_studies({"a": more}, one, -3).attrs["lost"] == ("a/ico/1",)
     of_eggs = sb.compare_studies({"a": more}, one, -3, methods="egg")

@@ -142,7 +142,10 @@ def _identity(tree: xr.DataTree) -> str:
 
 def _numbers(frame: pd.DataFrame, y: str) -> pd.DataFrame:
     values, errors = numbers_of(frame, y)
-    values = np.maximum(values, NEXT_TO_EQUAL) if y == RELATIVE else values
+    if y == RELATIVE:
+        values = np.maximum(values, NEXT_TO_EQUAL)
+        # An object that both studies reproduce must not hide what changed for all others.
+        errors = np.minimum(errors, values - NEXT_TO_EQUAL)
     errors = errors_of_logarithms(values, errors)
     return frame[[*_KEYS, "family"]].assign(value=values, log_error=errors)[np.isfinite(values)]
 
