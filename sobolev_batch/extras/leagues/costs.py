@@ -24,7 +24,7 @@ COST_NOTE = """\
 A mesh is on the front of its object unless another one, at no more cost, is nearer to the
 reference or as near at less cost. It is undecided where the errors of the distances leave that
 open. Costs are taken as measured. Means over objects are geometric, and those of members that all
-objects have."""
+objects have; an object that a mesh reproduces up to rounding has no part in them."""
 
 METHOD_COLUMNS = (
     Column("method", "method", kind="label"),
@@ -94,15 +94,19 @@ class CostLeague:
     def means(self) -> pd.DataFrame:
         """Members that all objects have, from the cheapest to the most expensive, one row each.
 
-        Columns: method; member; the cost by its name, relative and relative_error, geometric means over the objects;
-        fronts, the number of objects on whose front it is; front, True unless another member beats both of its means.
+        Columns: method; member; the cost by its name, relative and relative_error, geometric means over the objects
+        (without those that a mesh reproduces up to rounding, where there are others); fronts, the number of objects
+        on whose front it is; front, True unless another member beats both of its means.
         """
-        share = (self.meshes["relative_error"] / self.meshes["relative"]).fillna(np.inf)
+        # One object next to zero would outweigh all others.
+        is_known = self.meshes.groupby("object")["relative"].transform("min") > NEXT_TO_EQUAL
+        meshes = self.meshes[is_known] if is_known.any() else self.meshes
+        share = (meshes["relative_error"] / meshes["relative"]).fillna(np.inf)
         with np.errstate(divide="ignore"):
-            logarithms = self.meshes.assign(
+            logarithms = meshes.assign(
                 fall=np.log1p(-share.clip(upper=1.0)),
                 rise=np.log1p(share),
-                **{name: np.log(self.meshes[name]) for name in (self.x, "relative")},
+                **{name: np.log(meshes[name]) for name in (self.x, "relative")},
             )
         # A member may be there twice for an object whose names do not tell its meshes apart.
         members = logarithms.groupby(["method", "member"], sort=False)
@@ -110,8 +114,9 @@ class CostLeague:
         # The mean where all distances are as small, or as large, as their errors allow.
         widest = np.maximum(1 - found.pop("fall"), found.pop("rise") - 1)
         found["relative_error"] = found["relative"] * widest.where(np.isfinite(widest))
-        found["fronts"] = members["front"].sum()
-        found = found[members["object"].nunique() == len(self.objects)].sort_values([self.x, "relative"], kind="stable")
+        found["fronts"] = self.meshes.groupby(["method", "member"])["front"].sum()
+        found = found[members["object"].nunique() == meshes["object"].nunique()]
+        found = found.sort_values([self.x, "relative"], kind="stable")
         return found.assign(front=_is_unbeaten(found[self.x], found["relative"], found["relative"])).reset_index()
 
     @property

@@ -418,6 +418,15 @@ def test_the_errors_of_means_hold_all_that_those_of_the_objects_allow() -> None:
     assert np.isnan(by_cost(unknown).means.iloc[0]["relative_error"])
 
 
+def test_an_object_that_is_reproduced_has_no_part_in_means_by_cost() -> None:
+    tables = {name: priced({"quick": {1: 0.03}, "slow": {2: 0.01}}) for name in ("cow", "egg")}
+    cube = {"cube": priced({"quick": {1: 0.02}, "slow": {2: 1e-9}}).assign(relative_error=1e-5)}
+    made = by_cost({**tables, **cube})
+    assert made.means["relative"].to_numpy() == pytest.approx([0.03, 0.01])
+    assert made.means["fronts"].tolist() == [3, 3]
+    assert by_cost(cube).means["member"].tolist() == ["1", "2"]
+
+
 def test_names_that_hold_the_object_are_members_of_all_objects() -> None:
     tables = {name: priced({"quick": QUICK}, label=name + "_{:g}") for name in ("cow", "egg")}
     assert by_cost(tables).means["member"].tolist() == ["{object}_1", "{object}_2", "{object}_3"]
