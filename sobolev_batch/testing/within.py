@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from sobolev_batch.geometry.deviation import Deviation, Deviations, largest_deviation
-from sobolev_batch.geometry.formats.conversion import MeshLike
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.proximity import share_beyond
+from sobolev_batch.geometry.surface import placement_doubt
 from sobolev_batch.parameters import check_flags, length_in
 from sobolev_batch.tables.text import between, percent, place_text
 
@@ -31,6 +32,7 @@ class DeviationVerdict:
         one_way: True where only the points of the first mesh count.
         names: Names of the meshes.
         beyond_of: Number of the mesh that has this share of its area farther away, 0 or 1.
+        doubt: Question whether both are in the same unit of length and place, where they do not look it.
     """
 
     length: float
@@ -40,6 +42,7 @@ class DeviationVerdict:
     one_way: bool = False
     names: tuple[str, str] = ("a", "b")
     beyond_of: int = 0
+    doubt: str | None = None
 
     @property
     def largest(self) -> Deviation:
@@ -64,6 +67,7 @@ class DeviationVerdict:
         largest, beyond = self.largest, ""
         if self.outcome == "not within":
             beyond = f"; {percent(*self.beyond)} of the area of {self.names[self.beyond_of]} is farther away"
+            beyond += f"; {self.doubt}" if self.doubt else ""
             largest = replace(largest, upper=math.nan) if largest.upper > _CLOSE * largest.lower else largest
         deviation = f"{deviation_text(largest, self.unit, self._digits)} of {self.names[self.farther]}"
         return f"{answer}: largest deviation {deviation}{beyond}"
@@ -89,11 +93,13 @@ def judge_deviation(
     """Return whether the largest deviation of two meshes, with names, is within a length; see `assert_within`."""
     limit = length_in(length, unit)
     check_flags(one_way=one_way)
+    a, b = each(as_mesh, {"a": a, "b": b})
     verdict = DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit), one_way=one_way, names=names)
     if verdict.outcome != "not within":
         return verdict
     share, error, of = share_beyond(a, b, limit, one_way=one_way)
-    return replace(verdict, beyond=(share, error), beyond_of=of if share else verdict.farther)
+    doubt = placement_doubt(a.extent, b.extent)
+    return replace(verdict, beyond=(share, error), beyond_of=of if share else verdict.farther, doubt=doubt)
 
 
 def assert_within(

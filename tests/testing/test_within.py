@@ -43,6 +43,16 @@ def test_what_a_scan_has_not_seen_counts_unless_only_its_own_points_do() -> None
             sb.testing.assert_within(*pair, 1e-6, one_way=one_way)
 
 
+def test_another_unit_or_place_is_doubted() -> None:
+    ball = sb.shapes.icosphere(2)
+    for change, doubt in (
+        (ball.vertices / 25.4, "it is 25.4 times as small .*: is one in millimetres and the other in inches"),
+        (ball.vertices + 9.0, "its bounding box hardly overlaps .*: are both in the same place"),
+    ):
+        with pytest.raises(AssertionError, match=rf"is farther away; {doubt}\?$"):
+            sb.testing.assert_within((change, ball.triangles), ball, 0.1)
+
+
 @pytest.mark.parametrize(
     ("length", "unit", "passes"),
     [
