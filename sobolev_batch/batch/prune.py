@@ -13,7 +13,7 @@ from sobolev_batch.store.workspace import Contents
 
 _LOST, _KILLED, _UNLISTED = (
     "fields of meshes that are no longer in the study",
-    "leftovers of runs that were killed",
+    "leftovers of runs that were killed, and earlier fields of meshes that fail now",
     "tables that the store does not list",
 )
 
@@ -35,8 +35,8 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
     """Remove what a store keeps and no record needs, and return its bytes by kind; a dry run counts alone.
 
     These are fields of meshes that the study has lost, which would serve again if the meshes came back; what runs left
-    that were killed; and tables that are not listed. StoreError where the location has no store of a study, cannot be
-    written, is damaged, or a run is going on in it.
+    that were killed, or meshes had before they failed; and tables that are not listed. StoreError where the location
+    has no store of a study, cannot be written, is damaged, or a run is going on in it.
     """
     with nullcontext() if is_dry else locked(root_of(location), Lock.of_this_process()):
         store = Store.open(location)

@@ -327,6 +327,19 @@ def test_code_that_a_codec_names_is_not_imported(copy: Path, tmp_path: Path) -> 
     assert (tmp_path / "imported").exists()
 
 
+def test_the_earlier_field_of_a_mesh_that_fails_now_is_no_leftover_of_a_killed_run(
+    tmp_path: Path, threads: Client
+) -> None:
+    files = {"source": "files", "paths": [str(tmp_path / "a.off")]}
+    study = Study.from_table(small_table(family=[{"name": "files", **files}]))
+    tetrahedron = "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
+    for text in (tetrahedron, "OFF\n4 4 0\n"):
+        (tmp_path / "a.off").write_text(text)
+        run(study, tmp_path / "q.zarr", threads)
+    (kind,) = (kind for kind, size in prune(Location.parse(tmp_path / "q.zarr")).items() if size)
+    assert "earlier fields of meshes that fail now" in kind
+
+
 def test_what_no_record_needs_is_counted_and_then_removed(copy: Path, threads: Client) -> None:
     whole = Study.from_table(small_table())
     family = small_table()["family"][0]
