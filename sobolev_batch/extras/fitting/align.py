@@ -19,7 +19,7 @@ from sobolev_batch.transform.nufft_costs import NufftSpec
 
 # Stages: highest frequency on each axis, in cycles per radius, most points of each mesh, motions that go on to the next
 # stage, and steps.
-_STAGES = ((0.6, 1000, 6, 12), (1.4, 4000, 2, 12), (4.0, 10**9, 1, 25))
+_STAGES = ((0.6, 1000, 12, 12), (1.4, 4000, 2, 12), (4.0, 10**9, 1, 25))
 # The spacing is in cycles per radius: it lets surfaces lie over twice the radius from the center.
 _SPACING, _EPS = 0.2, 1e-6
 # A mesh whose center is farther from the other one, in radii, begins there: a period away nothing would draw it in.

@@ -80,3 +80,18 @@ def test_a_mesh_in_another_place_is_brought_back(angle: float, shift: tuple[floa
     there = sb.Mesh((mesh.vertices - middle) @ turn.T + middle + radius * np.array(shift), mesh.triangles)
     found = moved_by(there, sb.fitting.align(there, mesh)).vertices
     assert np.abs(found - mesh.vertices).max() < (1e-9 if max(shift) > 10 else 1e-12) * radius
+
+
+@pytest.mark.slow
+def test_a_bumpy_ball_whose_long_wavelengths_hardly_tell_rotations_apart_is_brought_back() -> None:
+    def bumpy(level: int, turn: Rotation) -> sb.Mesh:
+        ball = sb.shapes.icosphere(level)
+        unit = ball.vertices @ turn.as_matrix().T
+        x, y, _ = unit.T
+        return sb.Mesh(unit * (1 + 0.15 * np.sin(4 * x) * np.cos(3 * y))[:, None], ball.triangles)
+
+    mesh, there = bumpy(3, Rotation.from_rotvec([0.4, 0.5, -0.3])), Rotation.from_rotvec([1.0, -2.0, 0.5])
+    moved = sb.Mesh(mesh.vertices @ there.as_matrix().T + 3, mesh.triangles)
+    found = sb.fitting.align(moved, bumpy(4, Rotation.identity()))[:3, :3] @ there.as_matrix()
+    # A half turn around x takes the ball to itself.
+    assert min(np.abs(found - np.diag(turn)).max() for turn in ((1, 1, 1), (1, -1, -1))) < 1e-2
