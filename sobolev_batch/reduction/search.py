@@ -124,9 +124,10 @@ class Search:
         # Of equal meshes the one of the coarsest size.
         within = [one for one in trials if one.is_within]
         best = min(within, key=lambda one: (one.triangles, -sign * one.size), default=None)
-        others = [one for one in _told(_ordered(trials, sign)) if not one.is_within]
+        ordered = sorted(trials, key=lambda one: sign * one.size)
+        others = [one for one in _told(ordered) if not one.is_within]
         coarser = (one for one in others if best is None or sign * one.size > sign * best.size)
-        made = _ordered([one for one in trials if one.triangles], sign)
+        made = [one for one in ordered if one.triangles]
         return Bracket(best, next(coarser, None), all(a.lower <= b.upper for a, b in combinations(made, 2)))
 
     def next(self, trials: Sequence[Trial], count: int = 1) -> tuple[float, ...]:
@@ -136,7 +137,7 @@ class Search:
         finest, coarsest = sorted(sign * math.log(size) for size in (self.low, self.high))
         start = finest if bracket.best is None else sign * math.log(bracket.best.size)
         end = coarsest if bracket.failed is None else sign * math.log(bracket.failed.size)
-        again = self._again(_ordered(trials, sign), bracket, sign)
+        again = self._again(trials, bracket, sign)
         if len(trials) >= _MOST_TRIALS or not (again or self._is_open(bracket, start, end)):
             return ()
         points = {
@@ -153,9 +154,9 @@ class Search:
         sizes = dict.fromkeys([*again, *(self._size(sign, place, bracket) for place in places)])
         return tuple(size for size in sizes if size not in tried)[:count]
 
-    def _again(self, ordered: Sequence[Trial], bracket: Bracket, sign: int) -> tuple[float, ...]:
+    def _again(self, trials: Sequence[Trial], bracket: Bracket, sign: int) -> tuple[float, ...]:
         """Return a size beyond the coarsest one where only that failed, and a finer one, if any, holds."""
-        finer, last = [None, None, *ordered][-2:]
+        finer, last = [None, None, *sorted(trials, key=lambda one: sign * one.size)][-2:]
         is_open = last is not None and bracket.failed == last and (finer is None or bracket.best is not None)
         if last is None or not is_open or not _is_only_failure(finer, last, None):
             return ()
@@ -220,11 +221,6 @@ class Search:
         finer = -sign * math.inf if bracket.best is None else bracket.best.size + sign
         coarser = sign * math.inf if bracket.failed is None else bracket.failed.size - sign
         return float(min(max(round(size), min(finer, coarser)), max(finer, coarser)))
-
-
-def _ordered(trials: Sequence[Trial], sign: int) -> list[Trial]:
-    """Return trials from fine to coarse."""
-    return sorted(trials, key=lambda one: sign * one.size)
 
 
 def _is_only_failure(finer: Trial | None, trial: Trial, coarser: Trial | None) -> bool:

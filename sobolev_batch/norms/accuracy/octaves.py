@@ -299,7 +299,10 @@ def farther_out(state: State) -> State | None:
     if state.excess <= 1 or state.seconds >= _MOST_SECONDS:
         return _looked_at(state)
     octave = Octave(state.cutoff, len(state.octaves) + 1)
-    can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= _resolvable_frequency(problem)
+    smooth = max((surface.area for surface in problem.surfaces if isinstance(surface, Smooth)), default=0.0)
+    # The nodes of surfaces by formula resolve no more.
+    highest = np.sqrt(_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * smooth)) if smooth else np.inf
+    can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= highest
     points = int(_MORE_POINTS * beyond.points * state.excess**2)
     if beyond.hidden > MOSTLY:
         # Nothing is hidden from this many.
@@ -447,8 +450,3 @@ def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted:
 def _lattice(state: State, octave: Octave, intervals: int, rng: np.random.Generator) -> OctaveLattice:
     largest = min(_LARGEST_M, state.problem.accuracy.largest_intervals)
     return OctaveLattice.random(octave.lowest, octave.highest, min(intervals, largest), rng)
-
-
-def _resolvable_frequency(problem: Problem) -> float:
-    areas = [surface.area for surface in problem.surfaces if isinstance(surface, Smooth)]
-    return float((_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * max(areas))) ** 0.5) if areas else np.inf
