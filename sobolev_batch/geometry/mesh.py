@@ -191,12 +191,11 @@ class Mesh:
         (1, 0)
         """
         unused = len(self.vertices) - len(self.used_vertices)
-        sets = np.sort(self.triangles, axis=1)
-        sets = sets[np.lexsort(sets.T)]
+        duplicates = _count_duplicates(self.triangles)
         edges, components, boundary, nonmanifold, inconsistent = _edges_of(self.triangles, len(self.vertices))
         return {
             "zero_area_triangles": self._sizes.without_area,
-            "duplicate_triangles": int(np.count_nonzero((sets[1:] == sets[:-1]).all(axis=1))),
+            "duplicate_triangles": duplicates,
             "boundary_edges": boundary,
             "nonmanifold_edges": nonmanifold,
             "inconsistent_edges": inconsistent,
@@ -517,3 +516,9 @@ def _edges_of(triangles: Indices, vertex_count: int) -> tuple[int, int, int, int
     links = coo_array((np.ones(len(edges), np.int8), np.divmod(edges, vertex_count)), (vertex_count, vertex_count))
     components, _ = connected_components(links, directed=False)
     return len(edges), int(components), boundary, nonmanifold, alike
+
+
+def _count_duplicates(triangles: Indices) -> int:
+    ordered = np.sort(triangles, axis=1)
+    ordered = ordered[np.lexsort(ordered.T)]
+    return int(np.count_nonzero((ordered[1:] == ordered[:-1]).all(axis=1)))

@@ -76,10 +76,7 @@ def study_verdict(
 
 
 def _of_sizes(at_order: str, at_sizes: Sequence[pd.DataFrame]) -> str:
-    """Return a sentence on which family is nearest where meshes of several families have about as many triangles.
-
-    None is where it may owe that to more triangles.
-    """
+    """Return a sentence on which family is nearest among meshes of one size, by more than their triangles explain."""
     wins, leads = Counter[str](), list[float]()
     for members in at_sizes:
         if (closest := _nearest(members)) is not None:
