@@ -137,9 +137,9 @@ class Search:
         finest, coarsest = sorted(sign * math.log(size) for size in (self.low, self.high))
         start = finest if bracket.best is None else sign * math.log(bracket.best.size)
         end = coarsest if bracket.failed is None else sign * math.log(bracket.failed.size)
-        again = self._again(trials, bracket, sign)
-        if len(trials) >= _MOST_TRIALS or not (again or self._is_open(bracket, start, end)):
-            return ()
+        again = self._again(trials, bracket, sign) if len(trials) < _MOST_TRIALS else ()
+        if len(trials) >= _MOST_TRIALS or not self._is_open(bracket, start, end):
+            return again
         points = {
             sign * math.log(one.size): math.log(max(one.estimate / self.limit, math.exp(_LEAST_EXCESS)))
             for one in trials

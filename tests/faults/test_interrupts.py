@@ -53,7 +53,7 @@ import multiprocessing, signal
 from sobolev_batch.cli.interruption import Deadline, end_process
 
 if __name__ == "__main__":
-    Deadline("", 30.0).start()
+    Deadline().start()
     lock = multiprocessing.get_context("spawn").Lock()
     end_process(signal.SIGINT, "")
 """
