@@ -34,7 +34,7 @@ _LARGEST_REFERENCE = 3 << 20
 
 
 class TaskSizes(NamedTuple):
-    """What the tasks of a row take: its groups, the memory of one transform besides mesh and block, and of a task."""
+    """Sizes of the tasks of a row: its groups, the memory of one transform besides mesh and block, and of a task."""
 
     groups: BlockGroups
     allowed_bytes: float

@@ -63,7 +63,7 @@ class Trial:
 
     @property
     def has_distance(self) -> bool:
-        """Whether a mesh was made and compared."""
+        """True where a mesh was made and compared."""
         return math.isfinite(self.estimate)
 
 

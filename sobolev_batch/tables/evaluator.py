@@ -406,7 +406,7 @@ class Evaluator:
 
     @cached_property
     def _from_reference(self) -> dict[int, tuple[Reals, Reals]]:
-        """What lies beyond the octaves in the squared distance from the study's reference (orders,), by row."""
+        """Part beyond the octaves of the squared distance from the reference (orders,), and its error, by row."""
         known = {row: quality.difference for row, quality in self.qualities.items()}
         return {row: difference.at(self.orders) for row, difference in known.items() if difference is not None}
 
