@@ -59,7 +59,7 @@ class Frequencies:
     def from_solution(cls, problem: Problem, solution: Solution) -> Self:
         """Return the frequencies that a problem was solved with, for which something had to be computed."""
         widths = problem.support.widths
-        return cls(cast(Lattice, solution.lattice), solution.octaves, problem.orders, widths, solution.has_tail)
+        return cls(cast(Lattice, solution.lattice), solution.octaves, problem.orders, widths, bool(solution.remainders))
 
     @cached_property
     def weights(self) -> SobolevWeights:
@@ -149,15 +149,17 @@ class Frequencies:
         signs: Sequence[int],
         pair: Sequence[Surface],
         moved: Reals | float = 0.0,
+        remainders: Sequence[Remainder] = (),
     ) -> ReferenceEstimate:
         """Return the norm of the reference b of a pair a, b, and the product <a - b, b>.
 
         The difference a - b is a signed sum of surfaces, whose values are given: what a and b both have may be left
-        out, and it may lack a norm that is moved, see `Problem`.
+        out, and it may lack a norm that is moved, see `Problem`. What lies beyond some cutoffs may be known of it.
         """
         a_minus_b, b = Measure.from_values(difference, signs), Measure.from_values([reference], [1])
         a = Measure.from_values([*difference, reference], [*signs, 1])
-        beyond = self._beyond(surfaces, signs) if self.has_tail else None
+        known = next((one for one in remainders if one.cutoff == self._cutoff and one.is_known), None)
+        beyond = (known or self._beyond(surfaces, signs)) if self.has_tail else None
         of_difference = self.tail(a_minus_b, surfaces, signs, beyond)
         tails = self.tail(a, pair[:1], [1]), self.tail(b, pair[1:], [1]), of_difference
         norms = self.norms_of(b, pair[1:], self.errors([reference]), tails[1])
@@ -200,7 +202,9 @@ class Reference:
             return cls(Frequencies.from_solution(own, of_own), of_own.values[0], own.surfaces[0], known)
         if problem.is_whole:
             frequencies, pair = Frequencies.from_solution(problem, solution), problem.pair
-            found = frequencies.against(solution.values, solution.values[1], pair, problem.signs, pair)
+            found = frequencies.against(
+                solution.values, solution.values[1], pair, problem.signs, pair, remainders=solution.remainders
+            )
             return cls(frequencies, solution.values[1], pair[1], found)
         move = centering(problem.pair, OFF_CENTER)
         pair = [move.apply(surface) for surface in problem.pair]
@@ -217,5 +221,7 @@ class Reference:
         target = error_target(solution.estimate.values, problem.orders, problem.accuracy, problem.area)
         surfaces = [move.apply(surface) for surface in problem.surfaces]
         difference = [frequencies.values(surface, target, problem.execution) for surface in surfaces]
-        found = frequencies.against(difference, values, surfaces, problem.signs, pair, problem.moved)
+        found = frequencies.against(
+            difference, values, surfaces, problem.signs, pair, problem.moved, solution.remainders
+        )
         return cls(frequencies, values, pair[1], found)

@@ -287,7 +287,7 @@ def solution_of(state: State) -> Solution:
     found = estimate_norms(core.sums, core.weights, support, errors, state.tail)
     in_octaves = [octave.values for octave in state.octaves]
     values = [SurfaceValues(field, tuple(one[n] for one in in_octaves)) for n, field in enumerate(core.fields)]
-    return Solution(found, core.weights.lattice, tuple(values), has_tail=True)
+    return Solution(found, core.weights.lattice, tuple(values), remainders=state.remainders)
 
 
 def farther_out(state: State) -> State | None:

@@ -10,6 +10,7 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.norms.estimate import NormEstimate, change_of_root
 from sobolev_batch.norms.fields import Field
+from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.norms.tail.values import OctaveValues
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights
@@ -40,7 +41,8 @@ class Solution:
         lattice: Lattice of the fields; None where nothing had to be computed.
         values: Values of each surface on the lattice and in octaves beyond it.
         shortfall: Why the numbers miss the accuracy; None if they do not.
-        has_tail: True where all that lies beyond the lattice was measured, and the lattice ends in a step.
+        remainders: What lies beyond the lattice, which ends in a step then, and beyond each octave; empty where that
+            was not measured.
         alone: Norms that a distance of surfaces far apart consists of, each with a lattice of its own.
     """
 
@@ -48,7 +50,7 @@ class Solution:
     lattice: Lattice | None = None
     values: tuple[SurfaceValues, ...] = ()
     shortfall: AccuracyError | None = None
-    has_tail: bool = False
+    remainders: tuple[Remainder, ...] = ()
     alone: tuple[Self, ...] = ()
 
     @classmethod

@@ -221,7 +221,7 @@ def _fields(problem: Problem, lattice: Lattice, target: ErrorTarget) -> tuple[Fi
 def _of_apart(problem: Problem, seed: int) -> tuple[Interval, Method]:
     """Return bounds on the relative distance of surfaces far apart, which exceeds one, and what they follow from."""
     solution = solve(problem.with_rtol(_APART_RTOL), seed)
-    caution = _OCTAVES_CAUTION if any(one.has_tail for one in solution.alone) else 1.0
+    caution = _OCTAVES_CAUTION if any(one.remainders for one in solution.alone) else 1.0
     distance, norm = (Interval.of(one.estimate, caution) for one in (solution, solution.alone[1]))
     return distance.over(norm), "lattice" if caution == 1.0 else "octaves"
 
