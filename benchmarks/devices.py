@@ -18,7 +18,7 @@ from sobolev_batch import compiled
 from sobolev_batch.arrays import ComplexDtype
 from sobolev_batch.norms.tail.remainder import remainder
 from sobolev_batch.transform.backends import CPU, Backend, Gpu, gpu_backend
-from sobolev_batch.transform.exact import exact_transform, sampled_transform
+from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.fourier import Execution, TransformSettings, transform_block
 from sobolev_batch.transform.nufft import transform_points
 from sobolev_batch.transform.nufft_costs import NufftSpec, Workload
@@ -118,14 +118,13 @@ def _batch(gpu: Gpu, level: int, intervals: int, count: int, threads: int, just_
 def _exact_values(gpu: Gpu, level: int, count: int, effort: Effort) -> Iterator[Row]:
     mesh = sb.shapes.icosphere(level)
     frequencies = 4 * XI_MAX * np.random.default_rng(0).normal(size=(count, 3))
-    for name, transform in (("probes", exact_transform), ("samples", sampled_transform)):
 
-        def on(backend: object, transform: Callable[..., object] = transform) -> Callable[[object], object]:
-            return lambda given: transform(mesh, frequencies, backend=backend)
+    def on(backend: Backend) -> Callable[[object], object]:
+        return lambda given: exact_transform(mesh, frequencies, backend)
 
-        ours, processor = take_turns([on(gpu), on(CPU)], lambda: None, min(effort.repeats, 3))
-        what = f"GPU: exact values of {name}, T_{level} at {count} frequencies, against one core"
-        yield Row("9", what, as_seconds(ours), as_seconds(processor), processor / ours)
+    ours, processor = take_turns([on(gpu), on(CPU)], lambda: None, min(effort.repeats, 3))
+    what = f"GPU: exact values, T_{level} at {count} frequencies, against one core"
+    yield Row("9", what, as_seconds(ours), as_seconds(processor), processor / ours)
 
 
 def _close_points(gpu: Gpu, level: int, effort: Effort) -> Row:

@@ -5,6 +5,7 @@ corners and edges once for all. Phases are counted in cycles, and whole cycles a
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +19,10 @@ _COSINE = tuple((-1) ** n * _TURN ** (2 * n) / math.factorial(2 * n) for n in ra
 # The series in gaps below `_SERIES_GAP` takes 19 terms (-1)^(n // 2) h_n / (n+2)!.
 _SERIES_GAP = 2.0
 _FACTORS = np.array([(-1) ** (n // 2) / math.factorial(n + 2) for n in range(20)])
-# A product of gaps below this (radians cubed) goes through the stable form: the plain one would lose as many digits.
+# See `sobolev_batch.transform.exact`.
 _LEAST_PRODUCT = 2e-3
+# Gaps below this (radians) at all frequencies are for the series: the square, over that of a turn.
+_FINE = (1 / _TURN) ** 2
 # Frequencies at a time: the exponentials at some thousand vertices stay in a processor's cache.
 _LANES = 32
 # Splits a double into halves of 26 bits each.
@@ -41,23 +44,17 @@ def _cosine_and_sine(cycles: float) -> tuple[float, float]:
 
 
 @loop
-def _rest_of_product(a: float, b: float) -> tuple[float, float]:
-    """Return a b without whole cycles, and the rounding error of the product."""
-    shifted, other = _SPLITTER * a, _SPLITTER * b
-    a_high, b_high = shifted - (shifted - a), other - (other - b)
-    a_low, b_low = a - a_high, b - b_high
-    high = a * b
-    low = a_low * b_low - (((high - a_high * b_high) - a_low * b_high) - a_high * b_low)
-    return high - np.floor(high + 0.5), low
+def _high(a: Any) -> Any:
+    """Return numbers without its lower 26 bits."""
+    shifted = _SPLITTER * a
+    return shifted - (shifted - a)
 
 
 @part
-def _exponential(x: float, y: float, z: float, u: float, v: float, w: float) -> tuple[float, float]:
-    """Return real and imaginary part of exp(-2πi ξ·p), whatever the number of cycles."""
-    first, low_first = _rest_of_product(x, u)
-    second, low_second = _rest_of_product(y, v)
-    third, low_third = _rest_of_product(z, w)
-    return _cosine_and_sine(-(first + second + third + (low_first + low_second + low_third)))
+def _rest(x: float, x_high: float, u: float, u_high: float) -> Any:
+    """Return a product without whole cycles; that of the higher halves is exact."""
+    exact = x_high * u_high
+    return exact - np.floor(exact + 0.5) + (x_high * (u - u_high) + (x - x_high) * u)
 
 
 @part
@@ -98,14 +95,9 @@ def _quotient(a: complex, b: complex, c: complex, ab: float, ac: float) -> compl
 
 
 @part
-def _are_close(ab: float, bc: float, ac: float) -> bool:
-    return (abs(ab) < _SERIES_GAP) & (abs(bc) < _SERIES_GAP) & (abs(ac) < _SERIES_GAP)
-
-
-@part
 def _stable(a: complex, b: complex, c: complex, ab: float, bc: float, ac: float) -> complex:
     """Return the divided difference from the exponentials at the corners, whatever the gaps."""
-    if not _are_close(ab, bc, ac):
+    if max(abs(ab), abs(bc), abs(ac)) >= _SERIES_GAP:
         return _quotient(a, b, c, ab, ac)
     # The exponential at the mean of the nodes, from that at the middle one.
     return b * complex(*_cosine_and_sine((bc - ab) / (3 * _TURN))) * complex(*_series(ab, ac))
@@ -119,6 +111,13 @@ def _edges(vertices: Reals, triangle: Indices) -> tuple[float, float, float, flo
 
 
 @part
+def _longest_square(edges: tuple[float, float, float, float, float, float]) -> float:
+    px, py, pz, qx, qy, qz = edges
+    third = (px + qx) ** 2 + (py + qy) ** 2 + (pz + qz) ** 2
+    return max(px * px + py * py + pz * pz, qx * qx + qy * qy + qz * qz, third)
+
+
+@part
 def _gaps(
     edges: tuple[float, float, float, float, float, float], u: float, v: float, w: float
 ) -> tuple[float, float, float]:
@@ -128,76 +127,55 @@ def _gaps(
     return ab, bc, ab + bc
 
 
+@part
+def _is_thin(ab: float, bc: float, ac: float) -> bool:
+    return abs(ab * bc * ac) < _LEAST_PRODUCT * (1 + ab * ab + bc * bc)
+
+
 @loop
 def exact_sums(vertices: Reals, triangles: Indices, doubled: Reals, frequencies: Reals) -> Complexes:
-    """Return the sums (P,) of the transforms of triangles, each to about a rounding error of its area.
+    """Return the sums (P,) of the transforms of triangles, each to some rounding errors of its area.
 
     The vertices are (n, 3), the triangles (k, 3), twice their areas (k,), and the frequencies (3, P).
     """
-    sums = np.empty(frequencies.shape[1], dtype=np.complex128)
-    for first in range(0, len(sums), _LANES):
-        last = min(first + _LANES, len(sums))
-        u, v, w = frequencies[0, first:last], frequencies[1, first:last], frequencies[2, first:last]
-        # Of two rows of one array LLVM would make no vectors.
-        reals, imaginaries = np.zeros(len(u)), np.zeros(len(u))
-        for i in range(len(triangles)):
-            edges, area, apart = _edges(vertices, triangles[i]), doubled[i], 0
-            a, b, c = vertices[triangles[i, 0]], vertices[triangles[i, 1]], vertices[triangles[i, 2]]
-            px, py, pz, qx, qy, qz = edges
-            # The centroid, from the second corner.
-            x, y, z = b[0] + (qx - px) / 3, b[1] + (qy - py) / 3, b[2] + (qz - pz) / 3
-            for f in range(len(u)):
-                ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-                is_close = _are_close(ab, bc, ac)
-                apart += not is_close
-                cosine, sine = _exponential(x, y, z, u[f], v[f], w[f])
-                real, imaginary = _series(ab, ac)
-                reals[f] += area * (cosine * real - sine * imaginary) if is_close else 0.0
-                imaginaries[f] += area * (cosine * imaginary + sine * real) if is_close else 0.0
-            if apart:
-                for f in range(len(u)):
-                    ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-                    if not _are_close(ab, bc, ac):
-                        at_a = complex(*_exponential(a[0], a[1], a[2], u[f], v[f], w[f]))
-                        at_b = complex(*_exponential(b[0], b[1], b[2], u[f], v[f], w[f]))
-                        at_c = complex(*_exponential(c[0], c[1], c[2], u[f], v[f], w[f]))
-                        value = area * _quotient(at_a, at_b, at_c, ab, ac)
-                        reals[f] += value.real
-                        imaginaries[f] += value.imag
-        for f in range(len(u)):
-            sums[first + f] = complex(reals[f], imaginaries[f])
-    return sums
-
-
-@loop
-def sampled_sums(vertices: Reals, triangles: Indices, doubled: Reals, frequencies: Reals) -> Complexes:
-    """Return the same to fewer digits: the exponentials at the vertices serve all triangles around them."""
     sums = np.empty(frequencies.shape[1], dtype=np.complex128)
     cosines, sines = np.empty((len(vertices), _LANES)), np.empty((len(vertices), _LANES))
     for first in range(0, len(sums), _LANES):
         last = min(first + _LANES, len(sums))
         u, v, w = frequencies[0, first:last], frequencies[1, first:last], frequencies[2, first:last]
+        highest, u_high, v_high, w_high = np.max(u * u + v * v + w * w), _high(u), _high(v), _high(w)
         for i in range(len(vertices)):
             x, y, z = vertices[i]
+            x_high, y_high, z_high = _high(x), _high(y), _high(z)
             for f in range(len(u)):
-                cosines[i, f], sines[i, f] = _cosine_and_sine(-(u[f] * x + v[f] * y + w[f] * z))
+                rests = _rest(x, x_high, u[f], u_high[f]) + _rest(y, y_high, v[f], v_high[f])
+                cosines[i, f], sines[i, f] = _cosine_and_sine(-(rests + _rest(z, z_high, w[f], w_high[f])))
+        # Of two rows of one array LLVM would make no vectors.
         reals, imaginaries = np.zeros(len(u)), np.zeros(len(u))
         for i in range(len(triangles)):
             a, b, c = triangles[i]
-            edges, area, close = _edges(vertices, triangles[i]), doubled[i], 0
+            edges, area, thin = _edges(vertices, triangles[i]), doubled[i], 0
+            if _longest_square(edges) * highest < _FINE:
+                for f in range(len(u)):
+                    ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
+                    cosine, sine = _cosine_and_sine((bc - ab) / (3 * _TURN))
+                    real, imaginary = _series(ab, ac)
+                    real, imaginary = cosine * real - sine * imaginary, cosine * imaginary + sine * real
+                    reals[f] += area * (cosines[b, f] * real - sines[b, f] * imaginary)
+                    imaginaries[f] += area * (cosines[b, f] * imaginary + sines[b, f] * real)
+                continue
             for f in range(len(u)):
                 ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-                product = ab * bc * ac
-                is_apart = abs(product) >= _LEAST_PRODUCT
-                close += not is_apart
-                factor = area / product if is_apart else 0.0
+                is_thin = _is_thin(ab, bc, ac)
+                thin += is_thin
+                factor = 0.0 if is_thin else area / (ab * bc * ac)
                 middle, imaginary = cosines[b, f], sines[b, f]
                 reals[f] -= ((cosines[a, f] - middle) * bc + (cosines[c, f] - middle) * ab) * factor
                 imaginaries[f] -= ((sines[a, f] - imaginary) * bc + (sines[c, f] - imaginary) * ab) * factor
-            if close:
+            if thin:
                 for f in range(len(u)):
                     ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-                    if not abs(ab * bc * ac) >= _LEAST_PRODUCT:
+                    if _is_thin(ab, bc, ac):
                         at_a, at_b = complex(cosines[a, f], sines[a, f]), complex(cosines[b, f], sines[b, f])
                         value = area * _stable(at_a, at_b, complex(cosines[c, f], sines[c, f]), ab, bc, ac)
                         reals[f] += value.real

@@ -17,7 +17,7 @@ from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Counts, Smooth
 from sobolev_batch.transform.backends import CPU, Backend, compute_on
-from sobolev_batch.transform.exact import exact_transform, sampled_transform
+from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.lattice import Block, FrequencyLattice
 from sobolev_batch.transform.nufft import WeightedPoints
@@ -99,10 +99,6 @@ class SurfaceKind(ABC):
     def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
         """Return the exact transform at frequencies (P, 3), complex128 (P,). Threads and a backend may help."""
 
-    def sampled_values(self, frequencies: Reals, threads: int, backend: Backend = CPU) -> Complexes:
-        """Return the transform at frequencies (P, 3) by the fastest formula, complex128 (P,)."""
-        return self.exact_values(frequencies)
-
     def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
         """Return the transform of a closed form on a block of a lattice, complex128 (block.shape)."""
         raise TypeError(f"{type(self).__name__} has no closed form")
@@ -179,9 +175,6 @@ class _Triangles(SurfaceKind):
 
     def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
         return exact_transform(self.surface, frequencies, backend, threads)
-
-    def sampled_values(self, frequencies: Reals, threads: int, backend: Backend = CPU) -> Complexes:
-        return sampled_transform(self.surface, frequencies, threads, backend)
 
     def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
         return loosest_tolerance(self.surface, lattice, orders, norms)

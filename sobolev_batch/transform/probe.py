@@ -205,11 +205,9 @@ class Sample:
     exact: Complexes
 
     @classmethod
-    def from_surface(cls, surface: Surface, draws: Draws, execution: Execution = ON_CPU, *, fast: bool = False) -> Self:
-        """Return the sample of a surface at given draws; a fast one may be off by some 1e-13 of the area."""
-        kind = kind_of(surface)
-        values = kind.sampled_values if fast else kind.exact_values
-        return cls(draws, values(draws.frequencies, execution.threads, execution.backend))
+    def from_surface(cls, surface: Surface, draws: Draws, execution: Execution = ON_CPU) -> Self:
+        """Return the sample of a surface at given draws."""
+        return cls(draws, kind_of(surface).exact_values(draws.frequencies, execution.threads, execution.backend))
 
 
 def draws_for(
@@ -245,11 +243,10 @@ def probe_block(
     count = (_OWN if sample is None else _OWN_BESIDE_SAMPLE) * draws.count
     pooled, common = with_own(draws, count, lattice, block, values), draws.inside(block)
     if sample is None:
-        # What a fast sample is off by can only make the field look worse.
-        exact = Sample.from_surface(surface, pooled, execution, fast=True).exact
+        exact = Sample.from_surface(surface, pooled, execution).exact
     else:
         further = pooled.frequencies[np.count_nonzero(common) :]
-        own = kind_of(surface).sampled_values(further, execution.threads, execution.backend)
+        own = kind_of(surface).exact_values(further, execution.threads, execution.backend)
         exact = np.concatenate([sample.exact[common], own])
     probe = measure(pooled, values[tuple((pooled.indices - block.start).T)], exact)
     change = settings.kind_for(surface, lattice).change

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -22,7 +21,7 @@ from sobolev_batch.norms.fields import compute_field, field_for
 from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.transform import backends, exact, kinds
 from sobolev_batch.transform.backends import CPU, Gpu, backend_named, gpu_backend, try_out
-from sobolev_batch.transform.exact import exact_transform, sampled_transform
+from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, Transformed, TransformSettings, transform_block
 from sobolev_batch.transform.lattice import Block, FrequencyLattice, OctaveLattice
 from sobolev_batch.transform.nufft_costs import GPU_COSTS
@@ -210,9 +209,8 @@ def test_exact_transforms_agree(
     monkeypatch.setattr(exact, "_FEWEST_FOR_GPU", 1)
     mesh = MESHES["uneven"]
     frequencies = np.random.default_rng(0).uniform(-highest, highest, (32, 3))
-    for transform in (exact_transform, partial(sampled_transform, threads=2)):
-        found, expected = (transform(mesh, frequencies, backend=each) for each in (backend, CPU))
-        assert np.abs(found - expected).max() < 1e-13 * mesh.area
+    found, expected = (exact_transform(mesh, frequencies, each, threads=2) for each in (backend, CPU))
+    assert np.abs(found - expected).max() < 1e-13 * mesh.area
     # Else the processor may have been compared with itself.
     assert not caplog.records
 

@@ -16,7 +16,7 @@ from sobolev_batch import Mesh
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.shapes import icosphere
 from sobolev_batch.transform import exact
-from sobolev_batch.transform.exact import exact_transform, sampled_transform
+from sobolev_batch.transform.exact import exact_transform
 from tests.support.shapes import box
 from tests.transform.test_exact import SHAPES, oracle
 
@@ -70,11 +70,8 @@ def _frequencies(mesh: Mesh) -> Reals:
 def test_loops_agree_with_arrays(name: str) -> None:
     mesh = MESHES[name]()
     frequencies = _frequencies(mesh)
-    # In the faster formula phases are plain dot products.
-    cycles = float(np.abs(frequencies @ mesh.vertices.T).max())
-    for transform, most in ((exact_transform, 1e-14), (sampled_transform, 3e-13 + 1e-16 * cycles)):
-        arrays, loops = (values(transform, mesh, frequencies, compiled=compiled) for compiled in (False, True))
-        assert np.abs(loops - arrays).max() <= most * mesh.area
+    arrays, loops = (values(exact_transform, mesh, frequencies, compiled=compiled) for compiled in (False, True))
+    assert np.abs(loops - arrays).max() <= 5e-14 * mesh.area
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -87,19 +84,18 @@ def test_loops_agree_with_sixty_digits(shape: str) -> None:
         assert abs(value - expected) <= 1e-12 * abs(expected)
 
 
-@pytest.mark.parametrize("transform", [exact_transform, sampled_transform])
-def test_loops_pass_on_what_is_no_number(transform: Transform) -> None:
+def test_loops_pass_on_what_is_no_number() -> None:
     frequencies = np.array([[1.0, 2.0, 3.0], [np.nan, 2.0, 3.0], [1.0, np.inf, 3.0], [3.0, 2.0, 1.0]])
-    found = values(transform, box(), frequencies, compiled=True)
+    found = values(exact_transform, box(), frequencies, compiled=True)
     assert np.isnan(found).tolist() == [False, True, True, False]
-    assert values(transform, box(), frequencies[:0], compiled=True).shape == (0,)
+    assert values(exact_transform, box(), frequencies[:0], compiled=True).shape == (0,)
 
 
 def test_threads_change_nothing() -> None:
     mesh = icosphere(2)
     frequencies = _frequencies(mesh) * 3
-    alone = values(sampled_transform, mesh, frequencies, compiled=True)
-    shared = values(partial(sampled_transform, threads=3), mesh, frequencies, compiled=True)
+    alone = values(exact_transform, mesh, frequencies, compiled=True)
+    shared = values(partial(exact_transform, threads=3), mesh, frequencies, compiled=True)
     assert np.array_equal(alone, shared)
 
 
@@ -110,8 +106,8 @@ import sobolev_batch as sb
 a, b = sb.shapes.icosphere(1), sb.shapes.icosphere(2)
 sb.norm(a, -4.0, rtol=1e-2), sb.distance(a, b, -2.0, rtol=1e-1)
 print("numba" in sys.modules)
-from sobolev_batch.transform.exact import sampled_transform
-sampled_transform(sb.shapes.icosphere(4), 5.0 * np.random.default_rng(0).normal(size=(6000, 3)))
+from sobolev_batch.transform.exact import exact_transform
+exact_transform(sb.shapes.icosphere(4), 5.0 * np.random.default_rng(0).normal(size=(6000, 3)))
 print("numba" in sys.modules)
 """
 

@@ -16,7 +16,7 @@ from sobolev_batch import Mesh
 from sobolev_batch.geometry.overlap import shared_triangles
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.shapes import Similarity, icosphere
-from sobolev_batch.transform.exact import exact_transform, sampled_transform
+from sobolev_batch.transform.exact import exact_transform
 
 # 327,680 triangles, of which whole arrays stand out from what the process takes anyway.
 _LEVEL = 7
@@ -25,7 +25,7 @@ _STEPS: dict[str, Callable[[Mesh], object]] = {
     "move to the unit of the study": lambda mesh: Similarity(0.5, (1.0, 0.0, 0.0)).apply(mesh),
     "box and extent": lambda mesh: (mesh.bounding_sphere, mesh.extent),
     "exact values": lambda mesh: exact_transform(mesh, _FREQUENCIES),
-    "values in octaves, by two threads": lambda mesh: sampled_transform(mesh, _FREQUENCIES, 2),
+    "exact values by two threads": lambda mesh: exact_transform(mesh, _FREQUENCIES, threads=2),
     "directions of faces": lambda mesh: FaceNormals.from_surfaces([mesh]),
     "common triangles": lambda mesh: shared_triangles(mesh.vertices[mesh.triangles], np.zeros((1, 3, 3))),
 }

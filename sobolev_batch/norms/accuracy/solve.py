@@ -82,7 +82,7 @@ class DistanceTarget:
         """Return the target for the field of a surface."""
         values = np.array(self.distances)
         if self.reference is not None:
-            sample = Sample.from_surface(surface, self.reference.draws, fast=True)
+            sample = Sample.from_surface(surface, self.reference.draws)
             values = ESTIMATE_CAUTION * estimate([sample, self.reference], self.orders)
         return error_target(values, self.orders, self.accuracy, surface.area).tightened(_PAIR)
 

@@ -89,7 +89,7 @@ def octave_values(
         lattice = None if sample_set.is_drawn else sampling.lattices[number]
         if lattice is None or SurfaceSize.from_surface(surface).prefers_exact(lattice):
             frequencies = sampling.frequencies[sample_set.samples]
-            values.append(kind_of(surface).sampled_values(frequencies, execution.threads, execution.backend))
+            values.append(kind_of(surface).exact_values(frequencies, execution.threads, execution.backend))
         else:
             chosen = settings_on(lattice, surface, settings)
             block = transform_block(surface, lattice, lattice.half, chosen, execution).values
@@ -129,7 +129,7 @@ def _compared(
         chosen.append(sample_set.samples.start + drawn)
         scales.append(weights[drawn] / (count * chances[drawn]))
     places = np.concatenate(chosen)
-    differences = values[places] - kind.sampled_values(sampling.frequencies[places], ON_CPU.threads, backend)
+    differences = values[places] - kind.exact_values(sampling.frequencies[places], ON_CPU.threads, backend)
     return sampling.radii[places], np.concatenate(scales) * np.abs(differences) ** 2
 
 
