@@ -123,9 +123,9 @@ def printed_table(rows: Cells, headers: Sequence[str], style: Format, texts: Seq
     """Return cells as a table whose columns are aligned to the right, but for the first and for those of texts.
 
     In a text, spaces beside headers, texts and labels of the first column give way where lines would be too long: texts
-    are wrapped, and labels lose what they repeat and then their middle. Columns that still have no room follow in a
-    table of their own, beside the first column, or the first two where only these tell rows apart, and without rows
-    that have no cells there. Tabulate escapes LaTeX's special characters.
+    are wrapped, and labels lose their middle. Columns that still have no room follow in a table of their own, beside
+    the first column, or the first two where only these tell rows apart, and without rows that have no cells there.
+    Tabulate escapes LaTeX's special characters.
     """
     rows = [[_escaped(cell, style) for cell in row] for row in rows]
     headers = [_escaped(text, style) for text in headers]
@@ -181,27 +181,12 @@ def _with_short_texts(rows: Cells, headers: Sequence[str], texts: Sequence[int])
             width = max(_widths(rows, headers)[column] - lacking, SHORTEST_TEXT)
             cells = ["\n".join(textwrap.wrap(row[column], width, break_long_words=False)) for row in rows]
             rows = [[*row[:column], cell, *row[column + 1 :]] for row, cell in zip(rows, cells, strict=True)]
-    for shorten in (_without_repeats, lambda names, longest: [middle_cut(name, longest) for name in names]):
-        if (lacking := _lacking(_widths(rows, headers))) > 0:
-            labels = [row[0] for row in rows]
-            shorter = shorten(labels, max(_widths(rows, headers)[0] - lacking, SHORTEST_TEXT))
-            if len(set(shorter)) == len(set(labels)):
-                rows = [[label, *row[1:]] for label, row in zip(shorter, rows, strict=True)]
+    if (lacking := _lacking(_widths(rows, headers))) > 0:
+        longest = max(_widths(rows, headers)[0] - lacking, SHORTEST_TEXT)
+        shorter = [[middle_cut(label, longest), *others] for label, *others in rows]
+        if len({row[0] for row in shorter}) == len({row[0] for row in rows}):
+            return shorter
     return rows
-
-
-def _without_repeats(labels: Sequence[str], _longest: int) -> list[str]:
-    """Return labels FAMILY/NAME without the family, or the beginning of all names, at the beginning of the name."""
-    parts = [label.partition("/") for label in labels]
-    names = {name for _, slash, name in parts if slash}
-    common = os.path.commonprefix([*names]) if len(names) > 1 else ""  # noqa: RUF071 -- of characters
-    # Words and numbers stay whole.
-    common = common[: max(map(common.rfind, "_-. ")) + 1]
-    shorter = []
-    for family, slash, name in parts:
-        rest = name.removeprefix(family if name.startswith(family) else common)
-        shorter.append(f"{family}/…{rest}" if slash and rest and len(name) - len(rest) > 1 else family + slash + name)
-    return shorter
 
 
 def prose(lines: Iterable[str], style: Format) -> str:
