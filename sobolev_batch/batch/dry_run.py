@@ -12,7 +12,7 @@ from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.field_costs import TaskSizes, is_predictable, row_seconds, size_rows
 from sobolev_batch.batch.object_run import ended_before, lacks_nothing
-from sobolev_batch.batch.start import StoreLike, require_permission, settled, warnings_of
+from sobolev_batch.batch.start import StoreLike, require_permission, settled
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms.fields import Quality
@@ -23,6 +23,7 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import Objects, for_each_object, labelled
 from sobolev_batch.store.records import Record
 from sobolev_batch.store.workspace import Workspace
+from sobolev_batch.study.comparable import comparison_warnings
 from sobolev_batch.study.pilots import Look
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.study.schema import REFERENCE_LABEL
@@ -161,7 +162,7 @@ class StudyPlan(Shown):
             Hausdorff and Chamfer distances, and distances of very many pairs.
         processor_seconds: Processor time that a run will take, that of starting processes included.
         time: What is shown of both, line by line.
-        warnings: What would make a run useless or end it, see `warnings_of`.
+        warnings: What would make a run useless, see `comparison_warnings`.
 
     >>> import sobolev_batch as sb
     >>> plan = sb.plan("workflows/icosphere.toml")
@@ -338,7 +339,7 @@ def plan(
     if refused:
         few = f"{len(refused):,} of {len(plans) + len(refused):,} objects cannot be planned, for the reasons below"
         time = (*(time if plans else ()), few)
-    warnings, count = warnings_of(study, location), len(study.objects)
+    warnings, count = tuple(comparison_warnings(study)), len(study.objects)
     return StudyPlan(
         study.name, str(location), count, weight, plans, refused, seconds, processor_seconds, time, warnings
     )

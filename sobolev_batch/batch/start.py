@@ -1,20 +1,17 @@
 """What `plan`, `run` and `submit` settle first: the place of the store, permissions, and what to warn of."""
 
 import logging
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.parameters import as_names, check_flags, format_bytes
+from sobolev_batch.parameters import as_names, check_flags
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import known_names, quoted
 from sobolev_batch.store.location import Location
 from sobolev_batch.study.comparable import comparison_warnings
 from sobolev_batch.study.study import Study, StudyLike, as_study
-from sobolev_batch.tables.pairs import PAIR_BYTES
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +47,7 @@ def ready_to_run(
         # Other folders are not made: their names may be mistakes.
         with location.access("written"):
             _DEFAULT_FOLDER.mkdir(exist_ok=True)
-    for text in warnings_of(study, location):
+    for text in comparison_warnings(study):
         _log.warning("%s", text)
     return study, location
 
@@ -62,11 +59,6 @@ def require_permission(study: Study, allow_commands: bool) -> None:
             f"the study runs commands: {', '.join(study.commands[:_MOST_COMMANDS])}; if you trust it, allow them by "
             "--allow-commands (in Python: allow_commands=True)"
         )
-
-
-def warnings_of(study: Study, store: Location) -> tuple[str, ...]:
-    """Return a line for each thing that makes a run fail late, or useless: sizes, too few objects, or no space."""
-    return (*comparison_warnings(study), *_space_warnings(study, store))
 
 
 def _require_members(study: Study, only: Sequence[str]) -> None:
@@ -82,25 +74,4 @@ def _require_members(study: Study, only: Sequence[str]) -> None:
     if unknown:
         raise StudyError(
             f"no object, family or member of the study is {quoted(unknown[0])}; {known_names(unknown[0], known)}"
-        )
-
-
-def _space_warnings(study: Study, store: Location) -> Iterator[str]:
-    """Yield the need for space of the distances of all pairs, where a disk does not have it."""
-    needed = stored = 0
-    for name, one in study.objects.items() if study.pairs == "all" and not store.scheme else ():
-        # The run reports what cannot be listed.
-        with suppress(InputError):
-            needed += PAIR_BYTES * len(study.orders) * len(one.members) ** 2
-            stored += sum((store.below(name) if name else store).sizes("distances").values())
-    if not needed:
-        return
-    folder = Path(str(store)).absolute()
-    disk = shutil.disk_usage(next(one for one in (folder, *folder.parents) if one.exists()))
-    # Some file systems do not say how large they are.
-    if disk.total and needed - stored > disk.free:
-        yield (
-            f'pairs = "all": the distances of all pairs take {format_bytes(needed)} on disk, and '
-            f"{format_bytes(disk.free)} are free at {store}; "
-            'set pairs = "reference" in [compare], or choose another place with --store'
         )

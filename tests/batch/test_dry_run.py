@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,11 +17,10 @@ import sobolev_batch as sb
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.dry_run import seconds_of_missing
 from sobolev_batch.batch.field_costs import row_seconds
-from sobolev_batch.batch.start import warnings_of
 from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.store.layout import Store, hide_tables
-from sobolev_batch.store.location import Location
 from sobolev_batch.store.records import Record, Records
+from sobolev_batch.study.comparable import comparison_warnings
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.transform.fourier import TransformSettings, expected_points, field_seconds, transform_block
 from tests.support.commands import call
@@ -221,7 +218,7 @@ def test_what_would_make_a_run_useless_is_told_before_it(
     for suffix in ("ply", "off"):
         write_mesh(sb.shapes.icosphere(1), tmp_path / f"80.{suffix}")
     made = sb.Study.from_table(table, folder=tmp_path)
-    found = warnings_of(made, Location.parse(tmp_path / "s.zarr"))
+    found = tuple(comparison_warnings(made))
     assert len(found) == len(expected)
     for line, beginning in zip(found, expected, strict=True):
         assert line.startswith(beginning)
@@ -233,22 +230,6 @@ def test_a_plan_says_what_nobody_can_predict(tmp_path: Path) -> None:
     assert found.object.unknown == tuple(label for label in found.missing if label.startswith("coarse"))
     assert "programs and searches make 1 of the meshes, and their time is not known" in " ".join(str(found).split())
     assert "not known" not in str(sb.plan(sb.Study.from_table(small_table()), tmp_path / "s.zarr"))
-
-
-def test_pairs_that_the_disk_has_no_place_for_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    place = Location.parse(tmp_path / "not" / "yet.zarr")
-    needed = 5**2 * 2 * 6 * 8
-
-    def found(free: int, **changes: Any) -> tuple[str, ...]:
-        monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free, total=1))
-        return warnings_of(sb.Study.from_table(small_table(**changes)), place)
-
-    assert found(needed) == ()
-    (line,) = found(needed - 1)
-    assert f'2.4KB on disk, and 2.4KB are free at {place}; set pairs = "reference"' in line
-    assert found(0, compare=None) == ()
-    place.write({"distances/c/0": bytes(needed)})
-    assert found(0) == ()
 
 
 def test_a_plan_and_a_status_and_a_run_agree_on_what_is_missing() -> None:
