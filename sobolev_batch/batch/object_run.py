@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from sobolev_batch import compiled
-from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, in_place, result_from, result_of
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, in_place, result_from
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.field_costs import is_predictable, row_seconds, size_rows
 from sobolev_batch.batch.field_stage import compute_fields
@@ -91,7 +91,7 @@ def ended_before(study: Study, record: ObjectRecord | None) -> Ended | None:
     with suppress(InputError):  # Its run says what cannot be listed.
         one, members = study.object, study.object.members
         prints = {label: fingerprint_of(label, member) for label, (_, member) in members.items()}
-        if record.completes(object_key(one, members, prints)):
+        if record.key == object_key(one, members, prints):
             return Ended(record, reused=tuple(members))
     return None
 
@@ -236,25 +236,14 @@ def _compute_repairing(
             repairs += 1
             _log.warning("%s", error)
             # Where one is damaged, others may be.
-            rows = yield from _damaged_rows(cluster, workspace)
+            rows = yield from result_from(cluster, Task(_damaged_rows, (workspace,), stage="check"))
             workspace.withdraw(rows, "its values are not what was stored")
             repaired.update(rows)
 
 
-def _damaged_rows(cluster: Cluster, workspace: Workspace) -> Stages[list[int]]:
-    """Return the rows whose fields are not what their records say, found by the workers of a cluster."""
-    tasks = (
-        Task(Fields(workspace.store).damage, (i, record), row=i, label=workspace.labels[i], stage="check")
-        for i, record in workspace.complete.items()
-    )
-    damaged: list[int] = []
-
-    def take(task: Task, damage: Any) -> None:
-        if result_of(damage):
-            damaged.append(task.row)
-
-    yield Wave(cluster, tasks, take)
-    return sorted(damaged)
+def _damaged_rows(workspace: Workspace) -> list[int]:
+    """Return the rows whose fields are not what their records say."""
+    return [i for i, record in workspace.complete.items() if Fields(workspace.store).damage(i, record)]
 
 
 def lacks_nothing(workspace: Workspace) -> bool:

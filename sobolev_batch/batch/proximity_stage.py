@@ -101,7 +101,7 @@ def measure_proximity(
     """
     # Dask has a task done again whose worker was lost with the result.
     stored = Records(store).read_one(row)
-    if stored is not None and stored.proximity is not None and stored.proximity.completes(key):
+    if stored is not None and (known := stored.proximity) is not None and known.key == key and not known.reason:
         return stored
     started = time.perf_counter()
     try:

@@ -107,10 +107,6 @@ class ProximityRecord:
     numbers: Mapping[str, float] = field(default_factory=dict)
     seconds: float = 0.0
 
-    def completes(self, key: str) -> bool:
-        """Return whether the distances with this key were measured."""
-        return not self.reason and self.key == key
-
 
 class _Line:
     """A record as one line of JSON, which begins with its row: records of rows may trade places."""
@@ -208,10 +204,6 @@ class ObjectRecord(_Line):
     def failures(self) -> int:
         """Number of surfaces that could not be computed: all of an object that could not be carried out."""
         return self.total if self.reason else len(self.failed)
-
-    def completes(self, key: str) -> bool:
-        """Return whether nothing is missing of the object with this key."""
-        return bool(key) and self.key == key
 
 
 RecordType = TypeVar("RecordType", Record, ObjectRecord)
