@@ -187,16 +187,13 @@ def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> NDArray
 
     Distances and costs are (meshes,); a mesh may have another distance where others are compared with it.
     """
-    order = np.lexsort([others, costs])
-    cost, rival, place = costs.to_numpy()[order], others.to_numpy()[order], np.arange(len(order))
-    first, end = (np.searchsorted(cost, cost, side) for side in ("left", "right"))
-    padded = np.append(rival, np.inf)
-    cheaper = np.append(np.inf, np.minimum.accumulate(rival))[first]
-    # Among those of the same cost, the first is the nearest.
-    alike = np.where(place > first, padded[first], np.where(first + 1 < end, padded[first + 1], np.inf))
-    distance, result = own.to_numpy()[order], np.empty(len(order), dtype=bool)
-    result[order] = (alike >= distance) & (cheaper > distance)
-    return result
+    cost, rival, place = costs.to_numpy(), others.to_numpy(), np.arange(len(costs))
+
+    def beaten(i: int, distance: float) -> np.bool_:
+        beats = ((cost <= cost[i]) & (rival < distance)) | ((cost < cost[i]) & (rival <= distance))
+        return np.any(beats & (place != i))
+
+    return ~np.array([beaten(i, distance) for i, distance in enumerate(own)], dtype=bool)
 
 
 def format_cost_leagues(leagues: Sequence[CostLeague], style: Format = "text") -> str:
