@@ -95,18 +95,23 @@
     arrayminus: lower.map((error, i) => Math.min(error, 0.999 * values[i])),
   });
 
+  const marker = (family, size) => ({ color: series(family), symbol: symbol(family), size });
+  // The points of a family with their errors, and what is told of each.
+  const curve = ({ family, x, y, errors, lower }, text, changes = {}) => ({
+    type: "scatter", mode: "lines+markers", name: short(family, 40), x, y, error_y: bars(y, errors, lower),
+    line: { color: series(family), width: 1.8 }, marker: marker(family, 8), text: y.map(text), hoverinfo: "text", ...changes,
+  });
+  const dotted = (name, x, y, shape = "linear") => ({
+    type: "scatter", mode: "lines", name, x, y, line: { color: color("soft"), width: 1.2, dash: "dot", shape }, hoverinfo: "skip",
+  });
+  const logarithmic = (values, text) => ({ type: "log", ...(values.length ? ticks(values) : {}), title: { text } });
+
   const convergence = () => {
     const families = data.convergence[state.order] ?? [];
-    const traces = families.map((line) => ({
-      type: "scatter", mode: line.joined ? "lines+markers" : "markers", name: short(line.family, 40),
-      x: line.x, y: line.y, error_y: bars(line.y, line.errors),
-      line: { color: series(line.family), width: 1.8 },
-      marker: { color: series(line.family), symbol: symbol(line.family), size: 8 },
-      text: line.labels.map((label, i) =>
-        `${plain(label)}<br>${line.triangles[i].toLocaleString("en")} triangles, mean edge ${number(line.x[i])}` +
-        `<br>relative distance ${number(100 * line.y[i])} % ± ${line.errors[i] == null ? "?" : `${(100 * line.errors[i]).toPrecision(2)} %`}`),
-      hoverinfo: "text",
-    }));
+    const traces = families.map((line) => curve(line, (value, i) =>
+      `${plain(line.labels[i])}<br>${line.triangles[i].toLocaleString("en")} triangles, mean edge ${number(line.x[i])}` +
+      `<br>relative distance ${number(100 * value)} % ± ${line.errors[i] == null ? "?" : `${(100 * line.errors[i]).toPrecision(2)} %`}`,
+    { mode: line.joined ? "lines+markers" : "markers" }));
     const all = (key) => families.flatMap((line) => line[key]);
     const slope = [];
     if (all("x").length) {
@@ -114,61 +119,39 @@
       const ends = [Math.min(...all("x")), Math.max(...all("x"))];
       const [size, value] = [middle(all("x")), middle(all("y"))];
       slope.push(...ends.map((x) => value * (x / size) ** 2));
-      traces.push({
-        type: "scatter", mode: "lines", name: "slope 2", x: ends, y: slope,
-        line: { color: color("soft"), width: 1.2, dash: "dot" }, hoverinfo: "skip",
-      });
+      traces.push(dotted("slope 2", ends, slope));
     }
     draw("convergence", traces, {
-      xaxis: { type: "log", ...(all("x").length ? ticks(all("x")) : {}), title: { text: narrow() ? "mean edge length" : `mean edge length in ${plain(data.edge_unit)}` } },
-      yaxis: { type: "log", ...(slope.length ? ticks([...all("y"), ...slope]) : {}), title: { text: narrow() ? "" : "relative distance" } },
+      xaxis: logarithmic(all("x"), narrow() ? "mean edge length" : `mean edge length in ${plain(data.edge_unit)}`),
+      yaxis: logarithmic([...all("y"), ...slope], narrow() ? "" : "relative distance"),
     });
   };
 
   const league = () => {
     const methods = data.league[state.order];
-    const traces = methods.map(({ family, x, y, errors, lower }) => ({
-      type: "scatter", mode: "lines+markers", name: short(family, 40), x, y, error_y: bars(y, errors, lower),
-      line: { color: series(family), width: 1.8 },
-      marker: { color: series(family), symbol: symbol(family), size: 8 },
-      text: y.map((value, i) => `${plain(family)}<br>${plain(data.size)}: ${number(x[i])}` +
-        `<br>mean relative distance ${number(100 * value)} %`),
-      hoverinfo: "text",
-    }));
+    const traces = methods.map((line) => curve(line, (value, i) =>
+      `${plain(line.family)}<br>${plain(data.size)}: ${number(line.x[i])}<br>mean relative distance ${number(100 * value)} %`));
     draw("league", traces, {
-      xaxis: { type: "log", ...ticks(methods.flatMap(({ x }) => x)), title: { text: plain(data.size) } },
-      yaxis: { type: "log", ...ticks(methods.flatMap(({ y }) => y)), title: { text: narrow() ? "" : "mean relative distance" } },
+      xaxis: logarithmic(methods.flatMap(({ x }) => x), plain(data.size)),
+      yaxis: logarithmic(methods.flatMap(({ y }) => y), narrow() ? "" : "mean relative distance"),
     });
   };
 
   const costs = () => {
     const { lines, front } = data.costs[state.order];
-    const traces = lines.map(({ family, labels, x, y, errors }) => ({
-      type: "scatter", mode: "markers", name: short(family, 40), x, y, error_y: bars(y, errors),
-      marker: { color: series(family), symbol: symbol(family), size: 8 },
-      text: y.map((value, i) => `${plain(family)}/${plain(labels[i])}<br>${number(x[i])} seconds` +
-        `<br>relative distance ${number(100 * value)} %`),
-      hoverinfo: "text",
-    }));
-    traces.push({
-      type: "scatter", mode: "lines", name: "front", ...front,
-      line: { color: color("soft"), width: 1.2, dash: "dot", shape: "hv" }, hoverinfo: "skip",
-    });
-    draw("costs", traces, {
-      xaxis: { type: "log", ...ticks(lines.flatMap(({ x }) => x)), title: { text: "seconds to make the mesh" } },
-      yaxis: { type: "log", ...ticks(lines.flatMap(({ y }) => y)), title: { text: narrow() ? "" : "relative distance" } },
+    const traces = lines.map((line) => curve(line, (value, i) =>
+      `${plain(line.family)}/${plain(line.labels[i])}<br>${number(line.x[i])} seconds<br>relative distance ${number(100 * value)} %`,
+    { mode: "markers" }));
+    draw("costs", [...traces, dotted("front", front.x, front.y, "hv")], {
+      xaxis: logarithmic(lines.flatMap(({ x }) => x), "seconds to make the mesh"),
+      yaxis: logarithmic(lines.flatMap(({ y }) => y), narrow() ? "" : "relative distance"),
     });
   };
 
   const evolution = () => {
-    const traces = data.evolution[state.order].map(({ family, x, y, errors }) => ({
-      type: "scatter", mode: "lines+markers", name: short(family, 40), x, y, error_y: bars(y, errors),
-      line: { color: series(family), width: 1.8 },
-      marker: { color: series(family), symbol: symbol(family), size: 6 },
-      text: y.map((value, i) =>
-        `${plain(family)}<br>time ${x[i]}<br>distance ${number(value)} ± ${errors[i] ?? "?"}`),
-      hoverinfo: "text",
-    }));
+    const traces = data.evolution[state.order].map((line) => curve(line, (value, i) =>
+      `${plain(line.family)}<br>time ${line.x[i]}<br>distance ${number(value)} ± ${line.errors[i] ?? "?"}`,
+    { marker: marker(line.family, 6) }));
     draw("evolution", traces, {
       xaxis: { type: "linear", title: { text: "time" } },
       yaxis: { type: "log", dtick: 1, exponentformat: "power", title: { text: narrow() ? "" : "distance" } },
@@ -240,20 +223,13 @@
   const energy = () => {
     const wavelengths = data.energy.flatMap(({ x }) => x);
     const families = data.energy.map(({ family }) => family);
-    const traces = data.energy.map(({ family, label, x, y, errors }, i) => ({
-      type: "scatter", mode: "lines+markers", name: short(family, 40), legendgroup: family,
-      showlegend: families.indexOf(family) === i, x, y, error_y: bars(y, errors),
-      line: { color: series(family), width: 1.3 },
-      marker: { color: series(family), symbol: symbol(family), size: 5 },
-      text: y.map((value, j) => `${plain(label)}<br>wavelength ${number(x[j])}<br>${number(value)} of the limit`),
-      hoverinfo: "text",
+    const traces = data.energy.map((line, n) => curve(line, (value, i) =>
+      `${plain(line.label)}<br>wavelength ${number(line.x[i])}<br>${number(value)} of the limit`, {
+      legendgroup: line.family, showlegend: families.indexOf(line.family) === n,
+      line: { color: series(line.family), width: 1.3 }, marker: marker(line.family, 5),
     }));
-    traces.push({
-      type: "scatter", mode: "lines", name: "limit", x: [Math.max(...wavelengths), Math.min(...wavelengths)], y: [1, 1],
-      line: { color: color("soft"), width: 1.2, dash: "dot" }, hoverinfo: "skip",
-    });
-    draw("energy", traces, {
-      xaxis: { type: "log", autorange: "reversed", ...ticks(wavelengths), title: { text: `wavelength in ${plain(data.unit)}` } },
+    draw("energy", [...traces, dotted("limit", [Math.max(...wavelengths), Math.min(...wavelengths)], [1, 1])], {
+      xaxis: { autorange: "reversed", ...logarithmic(wavelengths, `wavelength in ${plain(data.unit)}`) },
       yaxis: { type: "log", dtick: 1, exponentformat: "power", title: { text: narrow() ? "" : "energy over its limit" } },
     });
   };
