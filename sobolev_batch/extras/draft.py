@@ -400,7 +400,7 @@ def _one_object(
         sections.append(_filled("family", name=_json(family), paths=paths, size=size))
         summary.append(f"family {family}: {size}")
     if counts:
-        sections.append(_filled("optional" if families else "decimated", path=_json(path), counts=counts))
+        sections.append(_filled("optional" if families else "decimated", counts=counts))
     return sections, tuple(summary)
 
 

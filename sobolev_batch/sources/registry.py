@@ -31,6 +31,10 @@ from sobolev_batch.sources.programs import Cost
 # Levels, or triangle counts of one mesh, that one source takes; and times.
 MOST_ENTRIES, _MOST_TIMES = 1000, 100_000
 
+_EXAMPLE = '{ source = "files", paths = ["a.ply"] }'
+# What a mesh that is missing may be.
+MESH_HINT = f"give one, such as mesh = {_EXAMPLE}"
+
 _HERE = "sobolev_batch.sources"
 # The sources of this folder, by name.
 _OWN = {
@@ -360,7 +364,7 @@ def parse_source(table: Mapping[str, Any]) -> Source:
 
 def _parse_nested(table: object) -> Source:
     if not isinstance(table, dict):
-        raise ValueError('must be a table that names a source, such as { source = "files", paths = ["a.ply"] }')
+        raise ValueError(f"must be a table that names a source, such as {_EXAMPLE}")
     with naming(f"the table {quoted(table)}"):
         return parse_source(table)
 
@@ -369,10 +373,20 @@ def _parse_nested(table: object) -> Source:
 OtherSource = Annotated[SerializeAsAny[Source], BeforeValidator(_parse_nested)]
 
 
-class NestedSource(Source):
-    """A source that works on the surfaces of another one; its key ``mesh`` has the table of that."""
+class _OfReference(Source):
+    """What stands for the reference of a study until that is known."""
 
-    mesh: OtherSource
+    def with_reference(self, reference: Source) -> Source:
+        return reference
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        raise StudyError(f"mesh is missing, and no reference can take its place; {MESH_HINT}")
+
+
+class NestedSource(Source):
+    """A source that works on the surfaces of another one: that of its key ``mesh``, by default a study's reference."""
+
+    mesh: OtherSource = Field(default_factory=_OfReference)
 
 
 class KeepingSource(Source):

@@ -12,7 +12,7 @@ from pydantic_core import ErrorDetails
 
 from sobolev_batch.errors import StudyError
 from sobolev_batch.sources.names import known_names, quoted, readable_key, shown_value
-from sobolev_batch.sources.registry import source_type_of
+from sobolev_batch.sources.registry import MESH_HINT, source_type_of
 from sobolev_batch.study import schema
 
 Sections = TypeVar("Sections", bound=schema.SurfaceSections)
@@ -63,7 +63,8 @@ def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
             hint = f"it belongs to [{owner}]" if owner else known_names(str(key[-1]), _known_keys(values, key[:-1]))
             messages.append(f"{name} is unknown; {hint}")
         elif kind == "missing":
-            messages.append(f"{name} is missing")
+            hint = f"; {MESH_HINT}" if key[-1] == "mesh" else ""
+            messages.append(f"{name} is missing{hint}")
         elif kind == "value_error":
             said, value = str(item["ctx"]["error"]), _value_at(values, key)
             is_said = isinstance(value, Mapping) or "found " in said or shown_value(value) in said

@@ -88,7 +88,7 @@ NO_COUNTS: dict[str, list[Any]] = {
     "triangles": [None, []],
     "triangles.0": [["80"]],
     "triangles.1": [[80, 3]],
-    "mesh": [None, "a.ply"],
+    "mesh": ["a.ply"],
     "mesh.levels.0": [{"source": "icosphere", "levels": ["1"]}],
     "target": [80],
 }

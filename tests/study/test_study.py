@@ -212,6 +212,7 @@ PLACES: list[tuple[str, Any, str]] = [
     ("mesh", {"a": 3, "b": {"mesh": "a"}}, r"^\[mesh.a\] must be a table, found 3; \[mesh.b\] must be a table"),
     ("family", [{**DECIMATED, "mesh": {"source": "files", "path": []}}], r"named 'd'\): mesh.path is unknown; .*paths"),
     ("family", [{**DECIMATED, "mesh": {"paths": ["a.ply"]}}], "source is missing"),
+    ("family", [{"name": "f", "source": "fit"}], r"mesh is missing; give one, such as mesh = \{ source = "),
     ("reference.radius", 1 << 2000, "reference.radius: an integer of TOML has 64 bits, found an integer of 2001 bits"),
     ("study.mesh", "ball", r"\[study\]: mesh is unknown; known are name, title"),
     ("family", [{"name": "d", "source": "decimate", "within": True}], "within must be a number or text.*, found true"),
@@ -247,6 +248,27 @@ REFUSED: list[tuple[Any, str]] = [
 @pytest.mark.parametrize(("table", "part"), REFUSED, ids=range(len(REFUSED)))
 def test_a_refusal_names_the_key_what_was_found_and_what_is_allowed(table: Any, part: str) -> None:
     assert re.search(part, refusal(table))
+
+
+def test_families_without_a_mesh_are_made_of_the_reference() -> None:
+    ball = {"source": "icosphere", "levels": [2]}
+    coarse = {"source": "decimate", "triangles": [100]}
+    kinds: list[dict[str, Any]] = [
+        {"source": "noisy", "amplitudes": [0.1]},
+        {"source": "command", "command": ["made", "{input}", "{output}"]},
+        coarse,
+    ]
+    for kind in kinds:
+        of_one, of_reference = ({"name": "f", **kind, **mesh} for mesh in ({"mesh": ball}, {}))
+        named, unnamed = (
+            Study.from_table(small_table(reference=ball, family=[one])).object.members for one in (of_one, of_reference)
+        )
+        assert {label: one.fingerprint() for label, (_, one) in named.items()} == {
+            label: one.fingerprint() for label, (_, one) in unnamed.items()
+        }
+    made_of_nothing = Study.from_table(small_table(reference=coarse))
+    with pytest.raises(sb.errors.StudyError, match="mesh is missing, and no reference can take its place; give one"):
+        assert made_of_nothing.object.members
 
 
 def test_all_problems_are_listed_at_once_up_to_ten() -> None:

@@ -48,6 +48,7 @@ class FitSource(NestedSource):
         target: Table of a source with one surface; the study's reference if left out.
     """
 
+    mesh: OtherSource
     target: OtherSource | None = None
     order: Annotated[float, Field(lt=-0.5, ge=-100.0)] = DEFAULT_ORDER
     steps: Annotated[int, Field(ge=1, le=100_000)] = DEFAULT_STEPS
