@@ -97,7 +97,7 @@ def test_a_file_is_whole_or_the_one_that_was_there(folder: Path, tmp_path: Path)
             continue
         (tmp_path / name).write_text("before")
         with full_disk(1000):
-            done = call("export", STORE, tmp_path / name, folder=folder)
+            done = call("export", STORE, "--output", tmp_path / name, folder=folder)
         assert (done.returncode, (tmp_path / name).read_text()) == (2, "before")
         assert f"{name}: the file cannot be written there: File too large" in done.stderr
     with full_disk(1000):
@@ -106,7 +106,7 @@ def test_a_file_is_whole_or_the_one_that_was_there(folder: Path, tmp_path: Path)
     assert {path.name for path in tmp_path.iterdir()} <= {"t.csv", "t.parquet", "t.nc"}
     (tmp_path / "link.csv").symlink_to("t.csv")
     for path in (tmp_path / "link.csv", Path("/dev/null")):
-        output("export", STORE, str(path), "--to", "csv", folder=folder)
+        output("export", STORE, "--output", str(path), "--format", "csv", folder=folder)
     assert (tmp_path / "link.csv").is_symlink()
     assert (tmp_path / "t.csv").read_text().startswith("order,mesh")
     assert Path("/dev/null").is_char_device()
@@ -114,25 +114,25 @@ def test_a_file_is_whole_or_the_one_that_was_there(folder: Path, tmp_path: Path)
 
 def test_tables_as_files_of_other_programs(folder: Path, tmp_path: Path) -> None:
     whole = sb.table(folder / STORE)
-    output("export", STORE, str(tmp_path / "t.csv"), folder=folder)
-    unknown = call("export", STORE, tmp_path / "t.dat", folder=folder)
+    output("export", STORE, "-o", str(tmp_path / "t.csv"), folder=folder)
+    unknown = call("export", STORE, "--output", tmp_path / "t.dat", folder=folder)
     assert unknown.returncode == 2
-    assert "--to" in unknown.stderr
+    assert "--format" in unknown.stderr
     frame = pd.read_csv(tmp_path / "t.csv", dtype={"distance": str})  # pandas 2 rounds numbers that it reads
     assert frame.columns.tolist() == whole.columns.tolist()
     assert frame["distance"].map(float).tolist() == whole["distance"].tolist()
     for style, library in (("parquet", "pyarrow"), ("netcdf", "h5netcdf")):
         path = tmp_path / f"t.{style}"
         if find_spec(library) is None:
-            done = call("export", STORE, path, "--to", style, folder=folder)
+            done = call("export", STORE, "--output", path, "--format", style, folder=folder)
             assert done.returncode == 2
             assert f"{library}" in done.stderr
             assert "pip install 'sobolev-batch[export]'" in done.stderr
         elif style == "parquet":
-            output("export", STORE, str(path), "--to", style, folder=folder)
+            output("export", STORE, "--output", str(path), "--format", style, folder=folder)
             pd.testing.assert_frame_equal(pd.read_parquet(path), whole, check_dtype=False)
         else:
-            output("export", STORE, str(path), "--to", style, folder=folder)
+            output("export", STORE, "--output", str(path), "--format", style, folder=folder)
             tree = xr.open_datatree(path, engine=library)
             assert tree["convergence"].to_dataset()["family"].values.tolist() == ["ico", "ico", "reference"]
             assert json.loads(tree.attrs["study"])["name"] == "cli"
@@ -305,6 +305,13 @@ def test_a_hole_that_was_closed_is_seen(folder: Path) -> None:
     share, error = found["beyond"]
     assert 0 <= share < 4 * error < 1e-3
     assert found["beyond_of"] == "a"
+    assert found["doubt"] is None
+    large = sb.read_mesh(folder / "full.off")
+    sb.write_mesh(sb.Mesh(25.4 * large.vertices, large.triangles), folder / "inches.off")
+    asked = ("compare", "inches.off", "full.off", "--within", "2")
+    doubt = document(*asked, folder=folder, status=1)["doubt"]
+    assert "25.4 times as large" in doubt
+    assert f"; {doubt}\n" in output(*asked, folder=folder, status=1)
     assert document("compare", "hole.off", "full.off", "--within", "2", folder=folder, status=1)["beyond_of"] == "b"
     assert document("compare", "hole.off", "full.off", "--within", "4", folder=folder)["beyond_of"] is None
 

@@ -39,14 +39,15 @@ class Verification(Shown):
 
     Attributes:
         store: Path or URL of the store.
-        complete: Number of surfaces with a completion record; their fields were read.
-        total: Number of surfaces of the study, and of those that it has lost whose fields stay.
+        complete: Number of surfaces of the study with a completion record; their fields were read.
+        total: Number of surfaces of the study.
         fields: Damage of fields and their records, by the label of the surface.
         tables: Damage of tables and coordinates, by the name of the array.
         withdrawn: True if the records of damaged fields were withdrawn, so that the next run makes them again, as it
             does damaged tables.
         objects: Verification of each object by its name, where the study names them. The total of an object without a
             store is 0.
+        removed: Number of surfaces that the study has no longer, and whose fields stay until `prune`; they were read.
 
     >>> import sobolev_batch as sb
     >>> sb.result_types.Verification("results.zarr", 5, 5, {}, {}, withdrawn=False).is_sound
@@ -60,11 +61,13 @@ class Verification(Shown):
     tables: Mapping[str, str]
     withdrawn: bool
     objects: Mapping[str, Verification] = field(default_factory=dict)
+    removed: int = 0
 
     def __str__(self) -> str:
         lines = []
         for name, one in (self.objects or {self.store: self}).items():
             counts = f"{one.complete} of {one.total} surfaces complete, their fields read back"
+            counts += f", with {one.removed} that the study has no longer" * (one.removed > 0)
             nothing = "its store cannot be read" if one.tables else "it has no results yet"
             lines.append(f"{name}: {counts if one.total else nothing}")
         damage = {**self.fields, **{f"table {name}": what for name, what in self.tables.items()}}
@@ -154,6 +157,7 @@ def _verify_all(
         tables=labelled({name: one.tables for name, one in verified.items()}),
         withdrawn=bool(damaged) and all(one.withdrawn for one in damaged),
         objects=verified,
+        removed=sum(one.removed for one in verified.values()),
     )
 
 
@@ -192,11 +196,12 @@ def _verify(store: Store, notify: Callable[[int, int], None], *, may_write: bool
         tables[f"chunk {'/'.join(map(str, index))} of {keys.split('/')[0]}"] = what
     return Verification(
         store=store.path,
-        complete=len(contents.complete),
-        total=len(rows),
+        complete=sum(labels[row] not in removed for row in contents.complete),
+        total=sum(labels[row] not in removed for row in rows),
         fields={labels[row]: damaged[row] for row in sorted(damaged)},
         tables=tables,
         withdrawn=may_write and bool(damaged or tables),
+        removed=sum(labels[row] in removed for row in contents.complete),
     )
 
 

@@ -147,7 +147,7 @@ class CompareOptions:
             same = same_surface(a, b, tolerance=tolerance, order=order, scaling=scaling, memory=self.memory)
             return f"{self.names[0]}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
         near = judge_deviation(a, b, str(self.within), self.unit, one_way=self.one_way, names=self.names)
-        numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit}
+        numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "doubt": near.doubt}
         numbers |= {"beyond": near.beyond, "beyond_of": "ab"[near.beyond_of] if near.outcome == "not within" else None}
         return f"{self.names[0]}: {near}", numbers | asdict(near.largest) | asdict(near.deviations)
 

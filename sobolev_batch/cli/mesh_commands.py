@@ -19,6 +19,7 @@ from sobolev_batch.cli.options import (
     json_option,
     memory_size,
     orders_option,
+    output_option,
     scheduler_options,
     workers_option,
 )
@@ -259,7 +260,7 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
     help="Search a parameter between two values; whole numbers try those alone. [default: triangles]",
 )
 @click.option("--suffix", metavar="SUFFIX", help="Give a command files of this format, such as .mesh. [default: .ply]")
-@click.option("--output", required=True, metavar="FOLDER|URL", help="Write meshes and records of trials there.")
+@output_option("Write meshes and records of trials there.", type=str, required=True, metavar="FOLDER|URL")
 @workers_option
 @scheduler_options()
 @format_option

@@ -81,6 +81,11 @@ def below_option(text: str, *, required: bool = False) -> Callable[[Callback], C
     return click.option("--below", type=fraction_of_norm, metavar="FRACTION", required=required, help=text)
 
 
+def output_option(text: str, **settings: Any) -> Callable[[Callback], Callback]:
+    """Return the option --output of a command that writes files."""
+    return click.option("-o", "--output", **{"type": PATH, "show_default": True, **settings}, help=text)
+
+
 def scheduler_options(*, required: bool = False) -> Callable[[Callback], Callback]:
     """Return the options of a command that may compute on a cluster, whose client is that of `client_of`."""
     scheduler = click.option(

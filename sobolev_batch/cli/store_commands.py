@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.cli.options import PATH, ChosenOrders, json_option, orders_option, store_argument
+from sobolev_batch.cli.options import ChosenOrders, json_option, orders_option, output_option, store_argument
 from sobolev_batch.cli.output import echo, echo_result, lengthen, progress_bar, replace_line
 from sobolev_batch.cli.program import EXIT_OTHER, EXIT_SOME_FAILED, cli
 
@@ -113,21 +113,21 @@ def prune_command(store: Location, yes: bool) -> None:
 
 @cli.command("export")
 @store_argument
-@click.argument("output", type=PATH)
+@output_option("Write the tables to this file.", required=True)
 @click.option(
-    *("--to", "style"),
+    *("--format", "style"),
     type=click.Choice(["parquet", "netcdf", "csv"]),
     help="Write a long table, or with netcdf the groups of tables. The first two need the extra export. "
-    "[default: by the ending of OUTPUT: .parquet, .nc, .csv]",
+    "[default: by the ending of the file: .parquet, .nc, .csv]",
 )
 @orders_option("Write the table of this order, for parquet and csv.", "the study's")
 def export_command(store: Location, output: Path, style: ExportFormat | None, orders: ChosenOrders) -> None:
-    """Write the tables of STORE to the file OUTPUT. Coordinates go with them."""
+    """Write the tables of STORE to a file. Coordinates go with them."""
     from sobolev_batch.tables.export import BY_ENDING, export
 
     style = style or BY_ENDING.get(output.suffix.lower())
     if style is None:
-        raise click.UsageError(f"no format has the ending {output.suffix!r}; choose one by --to parquet, netcdf or csv")
+        raise click.UsageError(f"no format has the ending {output.suffix!r}; choose one by --format parquet, netcdf or csv")
     if orders and style == "netcdf":
         raise click.UsageError("--order is for parquet and csv; netcdf has the orders of the study")
     export(store, output, style, orders)

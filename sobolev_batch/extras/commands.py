@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sobolev_batch.cli.interruption import Deadline
-from sobolev_batch.cli.options import PATH, Callback, ChosenOrders, location, orders_option, store_argument
+from sobolev_batch.cli.options import PATH, Callback, ChosenOrders, location, orders_option, output_option, store_argument
 from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, Command
 from sobolev_batch.cli.table_commands import table_options
@@ -69,19 +69,9 @@ def _meshes_option(text: str, default: str) -> Callable[[Callback], Callback]:
     )
 
 
-def _output_option(text: str, default: str) -> Callable[[Callback], Callback]:
-    return click.option("--output", type=PATH, default=default, show_default=True, help=text)
-
-
 @click.command("init", cls=Command, short_help="Write a study file for a folder of meshes.")
 @click.argument("folder", type=PATH, default=".")
-@click.option(
-    *("-o", "--output"),
-    type=PATH,
-    default="study.toml",
-    show_default=True,
-    help="Write the study to this file, which must not exist.",
-)
+@output_option("Write the study to this file, which must not exist.", default="study.toml")
 def init_command(folder: Path, output: Path) -> None:
     """Write a study file for the meshes in FOLDER.
 
@@ -99,7 +89,7 @@ def init_command(folder: Path, output: Path) -> None:
 )
 @click.argument("start", type=PATH)
 @click.argument("target", type=PATH)
-@click.option("-o", "--output", type=PATH, required=True, help="Write the mesh to this file, .ply, .obj, .off or .stl.")
+@output_option("Write the mesh to this file, .ply, .obj, .off or .stl.", required=True)
 @click.option("--order", type=float, default=DEFAULT_ORDER, show_default=True, help="Lower the distance of this order.")
 @click.option("--steps", type=int, default=DEFAULT_STEPS, metavar="N", show_default=True, help="Take N steps at most.")
 @click.option(
@@ -200,7 +190,7 @@ def _text(quality: FitQuality, scale: float) -> str:
 
 @click.command("plot", cls=Command)
 @store_argument
-@_output_option("Write the pictures into this folder.", ".")
+@output_option("Write the pictures into this folder.", default=".")
 @click.option(
     *("--format", "formats"),
     type=click.Choice(["png", "svg", "pdf"]),
@@ -315,7 +305,7 @@ def _require_folder(path: Path) -> None:
     help="Write ply for MeshLab and similar programs, or vtp for ParaView.",
 )
 @click.option("--distances", is_flag=True, help="Also write the distance of each vertex from the reference.")
-@_output_option("Write the files into this folder.", ".")
+@output_option("Write the files into this folder.", default=".")
 @_folder_option
 def witness_command(
     store: Location,
@@ -354,7 +344,7 @@ def witness_command(
 
 @click.command("report", cls=Command)
 @store_argument
-@_output_option("Write the page to this file.", "report.html")
+@output_option("Write the page to this file.", default="report.html")
 @_folder_option
 @_up_option
 @_meshes_option("Show this mesh with its witness function.", "a few")

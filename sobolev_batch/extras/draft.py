@@ -33,6 +33,8 @@ _MOST_BYTES = 32 << 20
 _REFERENCE = re.compile(r"(?<![^\W\d_])(original|reference|ref|target|ground[\W_]*truth|gt)(?![^\W\d_])", re.IGNORECASE)
 # These count only in the names of folders that hold the files themselves: objects/cow/ is the folder of one object.
 _REFERENCES = re.compile(r"(originals|references|targets|objects)", re.IGNORECASE)
+# Meshes of at least this part of the reference's triangles may be no versions of it.
+_AS_FINE = 0.8
 # The size of a mesh at an end of its name: cow_500, cow-1k7, cow 20.5, 500_cow.
 _NUMBER = r"\d+(?:[.,]\d+)?(?:[kKmM]\d*)?"
 _SIZE = re.compile(rf"^{_NUMBER}(?![^\W_])|{_NUMBER}$")
@@ -129,7 +131,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     if problem := _path_problem(str(below)):
         raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
     sizes, extents, left_out = _look_at(folder)
-    references = _references(sizes) or {"": _reference(folder, sizes, left_out)}
+    are_all = _REFERENCES.fullmatch(folder.resolve().name) is not None
+    references = _references(sizes, are_all=are_all) or {"": _reference(folder, sizes, left_out)}
     families = _families(_without_strangers(sizes, references.get("")), references)
     used = {*references.values(), *chain.from_iterable(families.values())}
     doubts = {
@@ -233,13 +236,13 @@ def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes")
     return next(candidate for candidate in numbered if caseless_key(candidate) not in known)
 
 
-def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
+def _references(sizes: Mapping[PurePosixPath, int], *, are_all: bool = False) -> dict[str, PurePosixPath]:
     """Return the references by their objects; none where all files are of one object.
 
-    There are several objects if several files are called references, of which some have files of their names, or where
-    there are no other files at all.
+    There are several objects if several files are called references, as all are in a folder that is called so, of which
+    some have files of their names, or where there are no other files at all.
     """
-    called = [path for path in sizes if _is_called_reference(path)]
+    called = [path for path in sizes if are_all or _is_called_reference(path)]
     references = {_object_of(path): path for path in called} or _finest_of_names(sizes)
     owners = {name for name, *_ in _owned(sizes, references)}
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called or references)
@@ -399,6 +402,8 @@ def _one_object(
         paths = "".join(f"    {_json(str(folder / member))},\n" for member in members)
         sections.append(_filled("family", name=_json(family), paths=paths, size=size))
         summary.append(f"family {family}: {size}")
+    if min((sizes[path] for paths in families.values() for path in paths), default=0) >= _AS_FINE * triangles:
+        summary.append("are these objects of their own? if so, move them into a folder called originals, and init that")
     if counts:
         sections.append(_filled("optional" if families else "decimated", counts=counts))
     return sections, tuple(summary)

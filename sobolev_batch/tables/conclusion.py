@@ -31,6 +31,8 @@ _STEEPEST = 2.0
 _MOST_SIZES = 8
 _MOST_FAMILIES = 6
 _MOST_REMARKS = 10
+# Whole verdicts on more objects fill several screens.
+_MOST_WHOLE = 3
 
 VERDICT_COLUMNS = (
     Column("verdict", "verdict", kind="label"),
@@ -218,8 +220,10 @@ def _absent(label: str, text: str) -> TableRow:
 
 
 def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None) -> str:
-    """Return the verdict on each object of a study as text, or their rows for programs."""
+    """Return the verdict on each object of a study, for people that of few objects, or a row for each of many."""
     stores, for_programs, sections = stores_of(store), {}, list[Section]()
+    if len(stores) > _MOST_WHOLE and style not in ("csv", "json"):
+        return format_objects(store, style, orders)
     for name, frame in (frames := tables_of(store, orders)).items():
         reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
         # Orders are written as in captions of tables and in options.
@@ -258,11 +262,13 @@ def format_objects(
     frame = frame[[*keys, "mesh", "relative", "relative_error", *_TOTALS]]
     frame = frame.sort_values(["missing", "relative"], ascending=False, kind="stable")
     sections, more = [] if len(frame) else [Section(sentences=[ALONE])], list[str]()
+    place = str(source_of(store) or "STORE" if isinstance(store, xr.DataTree) else store)
+    worst = [shlex.quote(f"{place}/{name}") for name in frame["object"][:1] if name]
+    one = [f"more on an object: sobolev-batch table verdict {name}" for name in worst]
     for order, of_order in frame.groupby("order", sort=False):
         shown = of_order.to_dict(orient="records")[:most]
         columns = [one for one in _OBJECT_COLUMNS if one.format is not count or any(row[one.name] for row in shown)]
         sections.append(Section(f"Objects at order {order:g}, the worst first", [(columns, shown)]))
         if len(shown) < len(of_order):
-            place = shlex.quote(str(source_of(store) or "STORE" if isinstance(store, xr.DataTree) else store))
-            more = [f"{len(of_order) - len(shown):,} more: sobolev-batch table objects {place}"]
-    return rendered(style, frame, sections, [*more, *notes_of_left_out(store, frames)])
+            more = [f"{len(of_order) - len(shown):,} more: sobolev-batch table objects {shlex.quote(place)}"]
+    return rendered(style, frame, sections, [*more, *one, *notes_of_left_out(store, frames)])

@@ -216,6 +216,17 @@ def test_originals_alone_are_compared_with_their_decimations(tmp_path: Path, tem
         assert [*one.members] == [*(f"quadric decimation/{count}" for count in (20, 40, 80, 160)), "reference"]
 
 
+def test_a_folder_called_originals_holds_objects_of_their_own(tmp_path: Path) -> None:
+    """Meshes as fine as each other, in another folder, are taken for one object; then the draft asks."""
+    for folder, name in product(("scans", "Originals"), ("scan_1", "scan_2")):
+        write(tmp_path / folder / f"{name}.ply", 2)
+    one, several = (sb.init_study(tmp_path / folder, tmp_path / f"{folder}.toml") for folder in ("scans", "Originals"))
+    assert [*as_study(one.path).objects] == [""]
+    assert "objects of their own? if so, move them into a folder called originals, and init that" in str(one)
+    assert [*as_study(several.path).objects] == ["scan_1", "scan_2"]
+    assert "objects of their own" not in str(several)
+
+
 def test_originals_alone_whose_names_follow_no_pattern_need_other_meshes(tmp_path: Path) -> None:
     for path in ("originals/cow.ply", "originals/egg.obj"):
         write(tmp_path / path, 2)

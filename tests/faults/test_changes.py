@@ -21,9 +21,11 @@ from distributed import Client
 from sobolev_batch import Study, open_store, run, table, verify
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.execution import Progress
+from sobolev_batch.batch.prune import prune
 from sobolev_batch.batch.status import status
 from sobolev_batch.errors import StoreError
 from sobolev_batch.store.layout import Store
+from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.store.records import Records
 from sobolev_batch.study import plan as plan_module
@@ -77,6 +79,19 @@ def test_a_change_of_the_study(
     assert others["other"].values.tolist() == (["reference"] if "compare" in changes else [*ALL])
     if "compare" in changes:
         assert np.allclose(others, pairs.sel(other=["reference"]), rtol=1e-12, atol=0)
+
+
+def test_meshes_that_the_study_has_no_longer_are_verified_and_counted_apart(
+    folder: Path, store_path: Path, threads: Client
+) -> None:
+    run(study_of(folder), store_path, threads)
+    (folder / "b.off").unlink()
+    run(study_of(folder), store_path, threads)
+    found = verify(store_path)
+    assert (found.complete, found.total, found.removed, status(store_path).total) == (2, 2, 1, 2)
+    assert "2 of 2 surfaces complete, their fields read back, with 1 that the study has no longer" in str(found)
+    prune(Location.parse(store_path), is_dry=False)
+    assert (verify(store_path).total, verify(store_path).removed) == (2, 0)
 
 
 @pytest.mark.parametrize("changes", [{"scaling": {"mode": "fixed", "scale": 0.5}}, {"transform": {"eps": 1e-7}}])
@@ -236,6 +251,7 @@ from sobolev_batch import Study
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.store.layout import Store
+from sobolev_batch.store.location import Location
 from sobolev_batch.store.records import Records
 from sobolev_batch.batch.field_tasks import Job, compute_mesh
 from tests.support.studies import small_table
