@@ -21,6 +21,7 @@ _OF_EXTRAS = {
         name: f"formats.{name}:FORMATS" for name in ("gltf", "gifti", "freesurfer", "vtk", "printing", "remeshing")
     },
     COMMANDS: {
+        "export": "commands:export_command",
         "fit": "commands:fit_command",
         "init": "commands:init_command",
         "plot": "commands:plot_command",

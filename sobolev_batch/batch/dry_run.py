@@ -74,8 +74,9 @@ class ObjectPlan:
         reference: Label of the reference.
         stored: Labels of the surfaces whose fields the store has already.
         refused: Reason for each surface that fits into no worker, by label.
-        doubtful: Reason for each surface that cannot be read, or may be in another unit or place than the reference, or
-            was noted where its file was read, as long as surfaces are quickly looked at.
+        failing: Reason for each surface that cannot be read or made, as long as surfaces are quickly looked at.
+        doubtful: Reason for each other one that may be in another unit or place than the reference, or was noted where
+            its file was read.
         lattice: Lattice of all fields.
         octaves: Number of octaves that are sampled beyond the lattice.
         dtype: Type of the fields, "complex128" or "complex64".
@@ -100,6 +101,7 @@ class ObjectPlan:
     reference: str
     stored: tuple[str, ...]
     refused: dict[str, str]
+    failing: dict[str, str]
     doubtful: dict[str, str]
     lattice: Lattice
     octaves: int
@@ -162,7 +164,7 @@ class StudyPlan(Shown):
             Hausdorff and Chamfer distances, and distances of very many pairs.
         processor_seconds: Processor time that a run will take, that of starting processes included.
         time: What is shown of both, line by line.
-        warnings: What would make a run useless, see `comparison_warnings`.
+        warnings: What would make a run useless, see `comparison_warnings`, or fail, as where no folder can hold its store.
 
     >>> import sobolev_batch as sb
     >>> plan = sb.plan("workflows/icosphere.toml")
@@ -215,8 +217,9 @@ class StudyPlan(Shown):
         if len(longest_first) > 1:
             rows = [one.summary(visible(name)) for name, one in longest_first]
             lines += ["", *printed_table(rows, _SUMMARY, "text").split("\n"), ""]
-            doubts = labelled({name: one.doubtful for name, one in longest_first})
-            lines += starmap(_beside, reasons("doubtful", together(doubts)))
+            for kind in ("failing", "doubtful"):
+                found = labelled({name: getattr(one, kind) for name, one in longest_first})
+                lines += starmap(_beside, reasons(kind, together(found)))
         for name, one in longest_first[:1]:
             lines += [*([f"{visible(name)}:"] if name else []), *starmap(_beside, one.lines)]
         return "\n".join(lines)
@@ -339,7 +342,8 @@ def plan(
     if refused:
         few = f"{len(refused):,} of {len(plans) + len(refused):,} objects cannot be planned, for the reasons below"
         time = (*(time if plans else ()), few)
-    warnings, count = tuple(comparison_warnings(study)), len(study.objects)
+    lacking = "" if store is None else location.lacks_folder()
+    warnings, count = (*comparison_warnings(study), *filter(None, [lacking])), len(study.objects)
     return StudyPlan(
         study.name, str(location), count, weight, plans, refused, seconds, processor_seconds, time, warnings
     )
@@ -399,13 +403,14 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
     stored = {} if workspace is None else {workspace.labels[i]: record for i, record in workspace.stored.items()}
     seconds, basis = seconds_of_missing(plan, stored, workers, client)
     bases.update(filter(None, [basis]))
-    doubtful, gpus = _doubts_of(plan, stored), sum(one.backend == "gpu" for one in workers.members)
+    (failing, doubtful), gpus = _doubts_of(plan, stored), sum(one.backend == "gpu" for one in workers.members)
     return ObjectPlan(
         store=str(location),
         labels=tuple(row.label for row in plan.rows),
         reference=plan.reference,
         stored=tuple(stored),
         refused=refused,
+        failing=failing,
         doubtful=doubtful,
         lattice=plan.lattice,
         octaves=0 if plan.tail is None else len(plan.tail.octaves),
@@ -421,6 +426,7 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
             *_task_lines(plan, sizes),
             ("store", f"{location}, {len(stored)} of {len(plan.rows)} already stored"),
             *reasons("refused", refused),
+            *reasons("failing", failing),
             *reasons("doubtful", doubtful),
             *_study_lines(plan),
             (
@@ -432,13 +438,14 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
     )
 
 
-def _doubts_of(plan: Plan, stored: Mapping[str, Record]) -> dict[str, str]:
-    """Return why surfaces cannot be read, or what makes one doubt them, by label; none is read twice."""
+def _doubts_of(plan: Plan, stored: Mapping[str, Record]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return why surfaces cannot be read, and what makes one doubt others, by label; none is read twice."""
     others = {row.label: (row.family, row.member) for row in plan.rows if row.label != plan.reference}
     # What is stored need not be read again.
     known = {label: Quality.from_json(stored[label].quality).extent for label in others if label in stored}
     seen = plan.look
-    look = Look({**seen.extents, **known}, dict(seen.set_aside), dict(seen.notes))
+    look = Look({**seen.extents, **known}, dict(seen.set_aside), dict(seen.notes), dict(seen.failing))
     look.at_all(others, plan.similarity, plan.reference_extent)
     doubts = {label: placement_doubt(extent, plan.reference_extent) for label, extent in look.extents.items()}
-    return look.notes | look.set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}
+    doubtful = look.notes | look.set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}
+    return look.failing, {label: doubt for label, doubt in doubtful.items() if label not in look.failing}

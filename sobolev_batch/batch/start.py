@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sobolev_batch.errors import InputError, StudyError
+from sobolev_batch.errors import InputError, StoreError, StudyError
 from sobolev_batch.parameters import as_names, check_flags
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import known_names, quoted
@@ -44,9 +44,10 @@ def ready_to_run(
     require_permission(study, allow_commands)
     _require_members(study, study.only)
     if store is None:
-        # Other folders are not made: their names may be mistakes.
         with location.access("written"):
             _DEFAULT_FOLDER.mkdir(exist_ok=True)
+    if problem := location.lacks_folder():
+        raise StoreError(problem)
     for text in comparison_warnings(study):
         _log.warning("%s", text)
     return study, location

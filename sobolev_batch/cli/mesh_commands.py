@@ -260,6 +260,7 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
     help="Search a parameter between two values; whole numbers try those alone. [default: triangles]",
 )
 @click.option("--suffix", metavar="SUFFIX", help="Give a command files of this format, such as .mesh. [default: .ply]")
+@click.option("--timeout", metavar="TIME", help="End a command after this time, such as '10 min'. [default: 1 h]")
 @output_option("Write meshes and records of trials there.", type=str, required=True, metavar="FOLDER|URL")
 @workers_option
 @scheduler_options()
@@ -273,6 +274,7 @@ def reduce_command(
     scheduler: str | None,
     trust_network: bool,
     suffix: str | None,
+    timeout: str | None,
     **settings: Any,
 ) -> None:
     """Find the fewest triangles of each mesh within a tolerance.
@@ -286,9 +288,9 @@ def reduce_command(
     """
     from sobolev_batch.batch.reduce import format_reductions, reduce
 
-    if suffix:
-        words = shlex.split(settings["method"])
-        settings["method"] = {"source": "command", "command": words, "input": suffix, "output": suffix}
+    given = {"input": suffix, "output": suffix, "timeout": timeout}
+    if own := {key: value for key, value in given.items() if value is not None}:
+        settings["method"] = {"source": "command", "command": shlex.split(settings["method"]), **own}
     tell = partial(echo, err=True) if len(files) > 1 else None
     with client_of(scheduler, trust_network, settings["workers"]) as client:
         found = reduce(files, client=client, on_progress=tell, **settings)

@@ -1,20 +1,18 @@
-"""Commands that read a store, besides its tables: status, verify, unlock, prune, export."""
+"""Commands that read a store, besides its tables: status, verify, unlock, prune."""
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.cli.options import ChosenOrders, json_option, orders_option, output_option, store_argument
+from sobolev_batch.cli.options import json_option, store_argument
 from sobolev_batch.cli.output import echo, echo_result, lengthen, progress_bar, replace_line
 from sobolev_batch.cli.program import EXIT_OTHER, EXIT_SOME_FAILED, cli
 
 if TYPE_CHECKING:
     from sobolev_batch.store.location import Location
-    from sobolev_batch.tables.export import ExportFormat
 
 _FOLLOW_SECONDS = 2.0
 
@@ -109,26 +107,3 @@ def prune_command(store: Location, yes: bool) -> None:
                 echo(f"{name + ': ' * bool(name)}{kind}: {format_bytes(size)}")
     remark = "removed" if yes else "can be removed: give --yes"
     echo(f"{format_bytes(total)} {remark}" if total else "nothing to remove")
-
-
-@cli.command("export")
-@store_argument
-@output_option("Write the tables to this file.", required=True)
-@click.option(
-    *("--format", "style"),
-    type=click.Choice(["parquet", "netcdf", "csv"]),
-    help="Write a long table, or with netcdf the groups of tables. The first two need the extra export. "
-    "[default: by the ending of the file: .parquet, .nc, .csv]",
-)
-@orders_option("Write the table of this order, for parquet and csv.", "the study's")
-def export_command(store: Location, output: Path, style: ExportFormat | None, orders: ChosenOrders) -> None:
-    """Write the tables of STORE to a file. Coordinates go with them."""
-    from sobolev_batch.tables.export import BY_ENDING, export
-
-    style = style or BY_ENDING.get(output.suffix.lower())
-    if style is None:
-        raise click.UsageError(f"no format has the ending {output.suffix!r}; choose one by --format parquet, netcdf or csv")
-    if orders and style == "netcdf":
-        raise click.UsageError("--order is for parquet and csv; netcdf has the orders of the study")
-    export(store, output, style, orders)
-    echo(output)

@@ -1,4 +1,4 @@
-"""Commands of the extras: init, fit, plot, witness, report, table time, table league.
+"""Commands of the extras: init, fit, plot, witness, report, export, table time, table league.
 
 As all modules of commands, this one imports whatever computes inside of its functions.
 """
@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sobolev_batch.cli.interruption import Deadline
-from sobolev_batch.cli.options import PATH, Callback, ChosenOrders, location, orders_option, output_option, store_argument
+from sobolev_batch.cli.options import (
+    PATH,
+    Callback,
+    ChosenOrders,
+    location,
+    orders_option,
+    output_option,
+    store_argument,
+)
 from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, Command
 from sobolev_batch.cli.table_commands import table_options
@@ -36,6 +44,7 @@ from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.shown import reasons, together
 
 if TYPE_CHECKING:
+    from sobolev_batch.extras.export import ExportFormat
     from sobolev_batch.extras.figures.style import PictureFormat
     from sobolev_batch.extras.figures.views import Axis, Colors
     from sobolev_batch.extras.fitting.fit import FitProgress, FitQuality
@@ -362,6 +371,31 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis | None,
     echo(output)
     for omission in omissions:
         echo(f"left out: {omission}", err=True)
+
+
+@click.command("export", cls=Command)
+@store_argument
+@output_option("Write the tables to this file.", required=True)
+@click.option(
+    *("--format", "style"),
+    type=click.Choice(["parquet", "netcdf", "csv"]),
+    help="Write a long table, or with netcdf the groups of tables. The first two need the extra export. "
+    "[default: by the ending of the file: .parquet, .nc, .csv]",
+)
+@orders_option("Write the table of this order, for parquet and csv.", "the study's")
+def export_command(store: Location, output: Path, style: ExportFormat | None, orders: ChosenOrders) -> None:
+    """Write the tables of STORE to a file. Coordinates go with them."""
+    from sobolev_batch.extras.export import BY_ENDING, export
+
+    style = style or BY_ENDING.get(output.suffix.lower())
+    if style is None:
+        raise click.UsageError(
+            f"no format has the ending {output.suffix!r}; choose one by --format parquet, netcdf or csv"
+        )
+    if orders and style == "netcdf":
+        raise click.UsageError("--order is for parquet and csv; netcdf has the orders of the study")
+    export(store, output, style, orders)
+    echo(output)
 
 
 @click.command("time")

@@ -26,6 +26,7 @@ from sobolev_batch.norms.tail.integrals import quantile
 from sobolev_batch.parameters import fraction, length_in
 from sobolev_batch.reduction.search import Trial
 from sobolev_batch.sources.names import known_names, quoted
+from sobolev_batch.sources.programs import CannotStartError
 from sobolev_batch.sources.registry import Member, load_mesh
 from sobolev_batch.transform.lattice import single_order
 
@@ -178,7 +179,7 @@ def tried(reference_member: Member, member: Member, limit: Limit, size: float) -
     """Make a mesh and judge it against a reference.
 
     Return the trial, and the mesh where it is within the limit. What goes wrong with the mesh is the reason of a trial
-    that failed; what is wrong with the reference is raised as a MeshError.
+    that failed; what is wrong with the reference, or with a program at any size, is raised as a MeshError.
     """
     reference, started = load_mesh(reference_member), time.perf_counter()
     mesh, reason, bounds = None, "", (math.inf,) * 3
@@ -190,6 +191,8 @@ def tried(reference_member: Member, member: Member, limit: Limit, size: float) -
         try:
             mesh = load_mesh(member)
             bounds = limit.bounds(mesh, reference)
+        except CannotStartError:
+            raise
         except InputError as error:
             reason = one_line(error)
     is_within, triangles = bounds[2] <= limit.largest * (1 + _EQUAL), 0 if mesh is None else len(mesh.triangles)

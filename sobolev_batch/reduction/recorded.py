@@ -1,6 +1,7 @@
 """The search for the fewest triangles of one mesh, recorded after each trial, so that it goes on where it was ended."""
 
 import hashlib
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import PurePath
@@ -137,11 +138,8 @@ class RecordedSearch:
         """Return why nothing was found; empty where something was."""
         if self.bracket(record).best is not None:
             return ""
-        # Where a mesh was clearly too far away, its upper bound was left where it was.
-        nearest = min(self._counted(record), key=lambda one: (one.lower, one.upper))
-        measure = f"{'1 - ' * self.limit.is_score}{self.limit.measure}"
-        found = f"{nearest.triangles:,} triangles, at least {nearest.lower:.4g} away ({measure})"
-        text = nearest.reason or f"nothing is within the tolerance of {self.limit.largest:.4g}; nearest are {found}"
+        counted, too_far = self._counted(record), f"nothing is within the tolerance of {self.limit.largest:.4g}"
+        text = self._nearest(record, counted, f"{too_far}; nearest are ")
         return "; ".join(filter(None, (text, self._unfollowed(record))))
 
     def remarks(self, record: SearchRecord) -> tuple[str, ...]:
@@ -153,6 +151,8 @@ class RecordedSearch:
         is_original = self.remesher.keeps(best.size, record.triangles)
         of = "original" if self.original is self.reference else "reference"
         itself = ": the smallest of those tried that does is the original itself" if is_original else ""
+        if others := [one for one in record.trials if is_original and one.triangles and not one.is_within]:
+            itself += f"; of the others, {self._nearest(record, others, 'nearest are ')}"
         # A search takes sizes that fail beside each other for too coarse ones.
         is_open = failed and failed.reason and not any(0 < one.triangles < best.triangles for one in record.trials)
         texts = (
@@ -164,6 +164,15 @@ class RecordedSearch:
             self._unfollowed(record),
         )
         return tuple(filter(None, texts))
+
+    def _nearest(self, record: SearchRecord, trials: Sequence[Trial], text: str) -> str:
+        """Return a text with the nearest of some trials, or else why that one could not be measured."""
+        # Where a mesh was clearly too far away, its upper bound was left where it was.
+        nearest = min(trials, key=lambda one: (one.lower, one.upper))
+        itself = " of the original itself" if self.remesher.keeps(nearest.size, record.triangles) else ""
+        measure = f"{'1 - ' * self.limit.is_score}{self.limit.measure}"
+        found = f"{nearest.triangles:,} triangles{itself}, at least {nearest.lower:.4g} away ({measure})"
+        return nearest.reason or f"{text}{found}"
 
     def _unfollowed(self, record: SearchRecord) -> str:
         """Return a sentence where the remesher makes about as many triangles whatever the size; else nothing."""

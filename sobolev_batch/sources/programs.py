@@ -70,6 +70,10 @@ class Cost:
     exit_status: float = _NOTHING_KNOWN
 
 
+class CannotStartError(MeshError):
+    """A program cannot be started, or not be given its input, whatever its parameters."""
+
+
 # What making a mesh took, and the mesh, or why there is none.
 Made = tuple[Cost, Mesh | str]
 
@@ -91,8 +95,7 @@ def printed(words: Sequence[str]) -> str:
             said.seek(0)
             text = said.read(_LONGEST_VERSION).decode(errors="replace").strip()
     except (OSError, ValueError) as error:
-        is_absent = isinstance(error, FileNotFoundError) and error.filename == words[0]
-        problem = f"{words[0]} is not installed, or not on the PATH" if is_absent else one_line(error)
+        problem = _cannot_start(words[0], error)
     else:
         if process.returncode and not problem:
             problem = f"it ended with exit status {process.returncode}"
@@ -104,7 +107,7 @@ def printed(words: Sequence[str]) -> str:
 def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout: float, largest_output: int) -> Made:
     """Run a program on files {input} and {output}, and return its mesh, or why it failed and what it said last.
 
-    It ends with this process at the latest.
+    It ends with this process at the latest. CannotStartError where it does not start.
     """
     with ExitStack() as stack:
         try:
@@ -117,12 +120,13 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
             guard = subprocess.Popen(watching, stdin=subprocess.PIPE, bufsize=0, start_new_session=True)  # noqa: S603
             stack.enter_context(guard)
         except OSError as error:
-            return Cost(), f"it has no scratch folder: {one_line(error)}; set TMPDIR to one that can be written"
+            problem = f"it has no scratch folder: {one_line(error)}; set TMPDIR to one that can be written"
+            raise CannotStartError(problem) from error
         files = {name: folder / f"{name}{suffix}" for name, suffix in zip((INPUT, OUTPUT), suffixes, strict=True)}
         try:
             _write(mesh, files[INPUT])
         except InputError as error:
-            return Cost(), f"its input cannot be written: {error}"
+            raise CannotStartError(f"its input cannot be written: {error}") from error
         filled = [PLACEHOLDER.sub(lambda found: str(files.get(found[1], found[0])), word) for word in words]
         started = time.perf_counter()
         try:
@@ -136,7 +140,8 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
                 start_new_session=True,
             )
         except (OSError, ValueError) as error:
-            return Cost(), f"{words[0]} cannot be started on this machine: {one_line(error)}"
+            problem = f"{words[0]} cannot be started on this machine: {_cannot_start(words[0], error)}"
+            raise CannotStartError(problem) from error
         if guard.stdin is not None:
             guard.stdin.write(b"%d\n" % process.pid)
 
@@ -156,8 +161,13 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
             try:
                 return cost, _read(files[OUTPUT])
             except InputError as error:
-                problem = f"{words[0]} wrote no mesh: {str(error).removeprefix(f'{files[OUTPUT]}: ')}"
+                problem = f"{words[0]} wrote what cannot be used: {str(error).removeprefix(f'{files[OUTPUT]}: ')}"
         return cost, ": ".join(filter(None, (problem, _tail(err, out))))
+
+
+def _cannot_start(word: str, error: Exception) -> str:
+    is_absent = isinstance(error, FileNotFoundError) and error.filename == word
+    return f"{word} is not installed, or not on the PATH" if is_absent else one_line(error)
 
 
 def _awaited(

@@ -195,15 +195,20 @@ class Location:
         with self.access("read"):
             return sync(self.zarr_store().names())
 
+    def lacks_folder(self) -> str:
+        """Return that no folder can hold a store here, if so: none is made, since its name may be a mistake."""
+        parent = Path(self.name).absolute().parent
+        is_there, problem = self.scheme or parent.is_dir(), f"there is no folder {parent} to hold the store"
+        return "" if is_there else f"{self.name}: {problem}; make it first"
+
     def require_free(self, besides: Collection[str] = ()) -> None:
         """Check that a store may be created here, without writing."""
         if not self.scheme:
             path = Path(self.name)
             if path.exists() and not path.is_dir():
                 raise ForeignError(f"{path}: it is a file; name a folder that is new or holds a store")
-            parent = path.absolute().parent
-            if not parent.is_dir():
-                raise StoreError(f"{path}: there is no folder {parent} to hold the store; make it first")
+            if problem := self.lacks_folder():
+                raise StoreError(problem)
         # A driver that was killed while it wrote the first key leaves a partial file.
         if any(name not in besides and not PARTIAL_FILE.search(name) for name in self.names()):
             raise ForeignError(f"{self}: the folder is not empty and holds no store; name another")

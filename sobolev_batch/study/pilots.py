@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sobolev_batch.arrays import ComplexDtype, Reals
-from sobolev_batch.errors import AccuracyError, MeshError, StudyError, one_line
+from sobolev_batch.errors import AccuracyError, StudyError, one_line
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent, Similarity, Surface
 from sobolev_batch.machine import available_cores
@@ -57,22 +57,25 @@ class Look:
     Attributes:
         extents: Extents in the study's unit of length.
         set_aside: Reasons why others cannot be compared with the reference.
+        failing: Reasons why some of these cannot be read or made.
         notes: What was noted where files were read, see `Mesh`.
     """
 
     extents: dict[str, Extent] = field(default_factory=dict)
     set_aside: dict[str, str] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
+    failing: dict[str, str] = field(default_factory=dict)
 
     def at(self, label: str, member: Member, similarity: Similarity, reference: Extent) -> Surface | None:
         """Return a surface in the study's unit; None where it cannot be made, or reaches far beyond the reference."""
         try:
             surface = similarity.apply(member.pilot())
-            times = surface.extent.reach / reference.reach
-            if times > _FARTHEST:
-                raise MeshError(f"its extent is {times:.3g} times that of the reference; are both in the same unit?")
         except Exception as error:  # its source may raise anything
-            self.set_aside[label] = one_line(error)
+            self.set_aside[label] = self.failing[label] = one_line(error)
+            return None
+        if (times := surface.extent.reach / reference.reach) > _FARTHEST:
+            text = f"its extent is {times:.3g} times that of the reference; are both in the same unit?"
+            self.set_aside[label] = text
             return None
         self.extents[label] = surface.extent
         self.take_notes(label, surface)

@@ -38,6 +38,12 @@ def records(plan: Plan, *labels: str, seconds: float) -> dict[str, Record]:
     return {label: Record(keys[label], "complete", seconds=seconds) for label in labels}
 
 
+def test_a_store_that_no_folder_can_hold_is_told(tmp_path: Path) -> None:
+    found = sb.plan(sb.Study.from_table(small_table()), tmp_path / "typo" / "s.zarr")
+    assert "there is no folder" in found.warnings[0]
+    assert sb.plan(sb.Study.from_table(small_table()), tmp_path / "s.zarr").warnings == ()
+
+
 def test_objects_that_cannot_be_planned_lack_something() -> None:
     command = {"source": "command", "command": ["remesh", "{input}", "{output}", "{triangles}"], "triangles": [20]}
     family = {"name": "ours", "mesh": {"source": "icosphere", "levels": [1]}, **command}

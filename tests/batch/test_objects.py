@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import warnings
 from dataclasses import replace
@@ -20,6 +21,7 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.cluster.execution import Progress
+from sobolev_batch.extras.export import export
 from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
@@ -29,7 +31,6 @@ from sobolev_batch.store.records import ObjectRecord, Records
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.tables.conclusion import format_objects, format_verdict
 from sobolev_batch.tables.convergence import format_table
-from sobolev_batch.tables.export import export
 from sobolev_batch.tables.smallest import format_smallest
 from tests.support.commands import call
 from tests.support.stores import flip
@@ -769,6 +770,17 @@ def test_verdicts_and_smallest_meshes_are_those_of_each_object(store: Path) -> N
         assert format_verdict(store / name) in format_verdict(store)
     text = format_smallest(store, "text", None, below=0.5)
     assert text.index("Object a") < text.index("Smallest mesh below 50 %") < text.index("Object b")
+
+
+def test_the_verdict_on_many_objects_has_a_line_for_each_the_worst_first(store_path: Path, threads: Client) -> None:
+    radii = {"big one": 1.2, "b": 1.0, "c": 1.1, "d": 0.5}
+    sb.run(study_of(balls(**radii)), store_path, threads)
+    text = format_verdict(store_path)
+    assert text == format_objects(store_path)
+    lines = text.splitlines()
+    worst = min(radii, key=lambda name: next(n for n, line in enumerate(lines) if line.startswith(f"{name} ")))
+    assert lines[-1].endswith(f": sobolev-batch table verdict {shlex.quote(f'{store_path}/{worst}')}")
+    assert set(pd.read_csv(StringIO(format_verdict(store_path, "csv")))["object"]) == {*radii}
 
 
 def test_objects_are_listed_from_the_worst_one(store: Path) -> None:

@@ -453,7 +453,36 @@ def test_the_command_ends_well_only_where_it_wrote_a_mesh_that_holds(tmp_path: P
     for within, status in (("0.1", 0), ("1e-9", 0), ("1e-30", 3)):
         done = call(*words, within)
         assert (done.returncode, (tmp_path / "reduced" / "scan.ply").exists()) == (status, status == 0)
-        assert ("the original itself" in " ".join(done.stdout.split())) == (within == "1e-9")
+        told = " ".join(done.stdout.split())
+        assert ("that does is the original itself" in told) == (within == "1e-9")
+        assert ("triangles of the original itself" in told) == (within == "1e-30")
+
+
+@pytest.mark.process
+def test_a_program_that_is_missing_is_tried_once() -> None:
+    found = found_by(lumpy(1), within=0.1, method="no-such-remesher {input} {output} {triangles}")
+    assert found.reason.endswith("no-such-remesher is not installed, or not on the PATH")
+    assert (found.trials, found.bracket.best) == ((), None)
+
+
+@pytest.mark.process
+def test_the_command_ends_programs_after_a_time(tmp_path: Path) -> None:
+    sb.write_mesh(lumpy(1), tmp_path / "scan.ply")
+    words = "reduce", tmp_path / "scan.ply", "--workers", "1", "--output", tmp_path / "reduced", "--within", "0.1"
+    method = "--with", "sh -c 'sleep 1000 # {input} {output} {triangles}'"
+    done = call(*words, *method, "--timeout", "10 ms")
+    assert (done.returncode, "ended after 0.01 s, its timeout" in " ".join(done.stdout.split())) == (3, True)
+    wrong = call(*words, *method, "--timeout", "soon")
+    assert (wrong.returncode, "timeout: must be a number of seconds" in wrong.stderr) == (2, True)
+
+
+def test_how_far_away_all_others_are_is_told_where_the_original_is_best() -> None:
+    def in_metres(mesh: sb.Mesh, triangles: int) -> sb.Mesh:
+        return sb.Mesh(1000 * np.asarray(mesh.vertices), mesh.triangles[:triangles])
+
+    (told,) = found_by(lumpy(1), within=0.1, method=in_metres).remarks
+    assert "the original itself; of the others, nearest are " in told
+    assert " triangles, at least 1" in told
 
 
 def test_a_mesh_that_cannot_be_reduced_is_told() -> None:
