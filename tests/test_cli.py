@@ -472,7 +472,7 @@ MISUSED = [
     (f"table {STORE} --order -3;-10", "'-3;-10' is neither a number nor a list of numbers"),
     (f"table {STORE} --below 1%", "No such option"),
     (f"table smallest {STORE}", "Missing option '--below'"),
-    (f"export {STORE} t.nc --to netcdf --order -3", "netcdf has the orders of the study"),
+    (f"export {STORE} -o t.nc --format netcdf --order -3", "netcdf has the orders of the study"),
     ("compare 1.off 3.off --rtol 1e-3 --M 64", "--rtol chooses the lattice"),
     ("compare 1.off 3.off --below 0.1 --proximity --rtol 0.1", "leave out --proximity, --rtol"),
     ("compare 1.off 3.off --below 0.1 --order -2,-4", "--below takes one --order"),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from pydantic import ValidationError
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.columns import ANGLE, FILE_LENGTH
@@ -93,7 +94,15 @@ class Remesher:
         if parameter not in kind.model_fields and kind.model_config.get("extra") != "allow":
             raise InputError(f"the source {table['source']} has no parameter {parameter} that could be searched")
         values = [*dict.fromkeys(ends or [_FEWEST])]
-        remesher = cls(parse_source({**table, parameter: values, "mesh": _ANY_MESH}), parameter, ends)
+        try:
+            source = parse_source({**table, parameter: values, "mesh": _ANY_MESH})
+        except ValidationError as error:
+            said = [one["msg"] for one in error.errors() if parameter in one["loc"]]
+            if not said:
+                raise
+            demand = f"between {values[0]:g} and {values[-1]:g}: {said[0].replace('Input should', 'each must')}"
+            raise InputError(f"{parameter} cannot be searched {demand}") from error
+        remesher = cls(source, parameter, ends)
         # It refuses wrong ends.
         remesher.search(Limit(1.0), _FEWEST, 1.0)
         return remesher

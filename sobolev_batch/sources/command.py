@@ -53,7 +53,11 @@ _FOLDER = "folder"
 def _seconds(value: object) -> float:
     """Return a time, given in seconds or as a text such as "10 min"."""
     with suppress(ValueError):
-        seconds = value if isinstance(value, int | float) else pd.Timedelta(str(value)).total_seconds()
+        try:
+            # Pandas would take a text without a unit for nanoseconds.
+            seconds = float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            seconds = pd.Timedelta(str(value)).total_seconds()
         if not isinstance(value, bool) and 0 < seconds < float("inf"):
             return float(seconds)
     raise ValueError("must be a number of seconds, or a time such as '10 min' or '2 h'")

@@ -553,7 +553,14 @@ def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path)
         ({"within": 1, "search": {"triangles": 9}}, r"one parameter is searched, as in .*, found \{'triangles': 9\}"),
         ({"within": 1, "method": 3}, "no source is named 3"),
         ({"within": 1, "precision": 0}, "precision"),
-        *(({"within": 1, "workers": wrong}, "workers must be a whole number from 1 on") for wrong in (0, -3, "two")),
+        *(
+            ({"within": 1, "workers": wrong}, "workers must be a whole number from 1 to")
+            for wrong in (0, -3, 10**30, "two")
+        ),
+        *(
+            ({"within": 1, "search": {"triangles": wrong}}, "triangles cannot be searched between .*: each must be ")
+            for wrong in ((-4, 100), (4, 10**30), (4.5, 1e30))
+        ),
     ],
 )
 def test_wrong_parameters_are_refused(options: dict[str, Any], message: str) -> None:

@@ -286,6 +286,7 @@ def test_a_command_is_searched_where_it_may_run(folder: Path) -> None:
         ({"triangles": [100]}, "triangles is searched"),
         ({"search": {"levels": [1, 2]}}, "levels"),
         ({"search": {"triangles": [9, 4]}}, "the smaller one first"),
+        ({"search": {"triangles": [-4, 100]}}, "between -4 and 100: each must be greater than or equal to 4"),
         ({"search": {"a": [1, 2], "b": [1, 2]}}, "one parameter is searched"),
         ({"search": {"triangles": [4]}}, "search"),
         ({"source": "command", "command": ["x", "{input}", "{output}"]}, "triangles"),

@@ -74,6 +74,11 @@ def test_the_version_of_a_function_is_known_where_its_source_is_not(monkeypatch:
         parse_source(table)
 
 
+def test_a_time_without_a_unit_is_in_seconds() -> None:
+    times = {"60": 60, 60: 60, "0.5": 0.5, "1 min": 60, "10 ms": 0.01}
+    assert {given: parse_source({**COPY, "timeout": given}).timeout for given in times} == times  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize(
     ("change", "refusal"),
     [

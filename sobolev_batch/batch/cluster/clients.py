@@ -28,6 +28,8 @@ from sobolev_batch.parameters import byte_count, format_bytes, is_whole_number
 
 # In less, a worker with all its libraries has no memory left for any transform.
 _LEAST_BYTES = 700_000_000
+# Hardly any machine has more cores.
+_MOST_WORKERS = 1024
 # Dask has workers hand freed memory back at once, and the arrays of a task come and go: taking fresh memory
 # for each took a third of the time of tables. What glibc may keep is bounded.
 _KEPT_BYTES = 64 << 20
@@ -148,8 +150,8 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
 
 def check_cluster(client: Client | None, workers: object, memory: object = None) -> None:
     """Refuse by an InputError a client that is of no use, processes to start beside it, and a wrong number of them."""
-    if workers is not None and (not is_whole_number(workers) or workers < 1):
-        raise InputError(f"workers must be a whole number from 1 on, found {workers!r}")
+    if workers is not None and (not is_whole_number(workers) or not 1 <= workers <= _MOST_WORKERS):
+        raise InputError(f"workers must be a whole number from 1 to {_MOST_WORKERS:,}, found {workers!r}")
     if client is not None:
         require_blocking(client)
         if workers is not None or memory is not None:

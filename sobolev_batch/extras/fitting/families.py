@@ -10,7 +10,7 @@ from pydantic import Field
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.extras.fitting.fit import MOST_TRIANGLES, fitted_mesh, largest_while_refining
-from sobolev_batch.extras.fitting.objective import MOST_SMOOTHING, FitSettings
+from sobolev_batch.extras.fitting.objective import MOST_SMOOTHING, MOST_STEPS, FitSettings
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.norms import DEFAULT_ORDER
@@ -51,7 +51,7 @@ class FitSource(NestedSource):
     mesh: OtherSource
     target: OtherSource | None = None
     order: Annotated[float, Field(lt=-0.5, ge=-100.0)] = DEFAULT_ORDER
-    steps: Annotated[int, Field(ge=1, le=100_000)] = DEFAULT_STEPS
+    steps: Annotated[int, Field(ge=1, le=MOST_STEPS)] = DEFAULT_STEPS
     smoothing: Annotated[float, Field(ge=0.0, le=MOST_SMOOTHING)] = DEFAULT_SMOOTHING
     keep_boundary: bool = False
 

@@ -42,7 +42,7 @@ _TARGET_FRACTION, _MESH_FRACTION = 2e-3, 0.02
 # A distance of this many errors of its fields is not lowered any further.
 _LEAST_ERRORS = 5.0
 # Beyond, steps lose their digits.
-MOST_SMOOTHING = 1e12
+MOST_SMOOTHING, MOST_STEPS = 1e12, 100_000
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class FitSettings:
 
     def __post_init__(self) -> None:
         order = single_order(self.order)
-        if not is_whole_number(self.steps) or self.steps < 1:
-            raise InputError(f"steps must be a whole number from 1 on, found {self.steps!r}")
+        if not is_whole_number(self.steps) or not 1 <= self.steps <= MOST_STEPS:
+            raise InputError(f"steps must be a whole number from 1 to {MOST_STEPS:,}, found {self.steps!r}")
         if not is_finite_number(self.smoothing) or not 0 <= self.smoothing <= MOST_SMOOTHING:
             raise InputError(f"smoothing must be a number from 0 to {MOST_SMOOTHING:g}, found {self.smoothing!r}")
         check_flags(keep_boundary=self.keep_boundary)
