@@ -164,7 +164,7 @@ class StudyPlan(Shown):
             Hausdorff and Chamfer distances, and distances of very many pairs.
         processor_seconds: Processor time that a run will take, that of starting processes included.
         time: What is shown of both, line by line.
-        warnings: What would make a run useless, see `comparison_warnings`, or fail, as where no folder can hold its store.
+        warnings: What would make a run useless, see `comparison_warnings`, or end it: no folder for its store.
 
     >>> import sobolev_batch as sb
     >>> plan = sb.plan("workflows/icosphere.toml")
