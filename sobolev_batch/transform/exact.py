@@ -16,7 +16,6 @@ product" (2005), doi:10.1137/030601818. That is valid without over- and underflo
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 
 import numpy as np
 
@@ -199,42 +198,22 @@ def doubled_areas(mesh: Mesh) -> Reals:
     return doubled
 
 
-def _series(ab: Array, ac: Array, widest: float) -> tuple[Array, Array]:
+def _series(ab: Array, ac: Array, widest: float) -> Pair:
     """Return real and imaginary part of Σ_n i^n h_n / (n+2)!, h_n the complete homogeneous symmetric polynomials.
 
-    As the nodes have mean zero, h_n is the sum of C(j+k, k) p^j q^k over 2j + 3k = n, p = Σ node²/2, q their product.
+    As the nodes have mean zero, h_n = p h_(n-2) + q h_(n-3), with p = Σ node²/2 and their product q.
     """
     lowest = (ab + ac) / -3
     p = (ab * (ab - ac) + ac * ac) / 3
     q = lowest * (ab + lowest) * (ac + lowest)
-    n = 2
-    # |h_n| <= 2 (widest · 2/3)^n: stop where the next term is below half a rounding error of 1/2.
-    while 2 * (widest * 2 / 3) ** (n + 1) / math.factorial(n + 3) > 2e-17:
-        n += 1
-    # Powers of q with even exponents are real, the others imaginary; Horner's scheme in p, and then in q².
-    parts: list[Array] = [np.zeros_like(p), np.zeros_like(p)]
-    squares = q * q
-    for power, (last, *others) in reversed(list(enumerate(_coefficients(n)))):
-        values = np.zeros_like(p)
-        values += last
-        for coefficient in others:
-            values *= p
-            values += coefficient
-        parts[power % 2] *= squares
-        parts[power % 2] += values
-    return parts[0], parts[1] * q
-
-
-@cache
-def _coefficients(highest: int) -> list[list[float]]:
-    """Return the factors of p^j q^k in a series up to n, for each k those of the highest j first."""
-    return [
-        [
-            (-1) ** ((2 * j + 3 * k) // 2) * math.comb(j + k, k) / math.factorial(2 * j + 3 * k + 2)
-            for j in reversed(range((highest - 3 * k) // 2 + 1))
-        ]
-        for k in range(highest // 3 + 1)
-    ]
+    parts, (before, last, this), n = [0.5 - p / 24, np.zeros_like(p)], (np.ones_like(p), np.zeros_like(p), 1 * p), 3
+    # |h_n| <= 2 (widest · 2/3)^n: stop where a term is below half a rounding error of 1/2.
+    while 2 * (widest * 2 / 3) ** n / math.factorial(n + 2) > 2e-17:
+        before *= q
+        before += p * last
+        before, last, this, n = last, this, before, n + 1
+        parts[(n - 1) % 2] += (-1) ** ((n - 1) // 2) / math.factorial(n + 1) * this
+    return parts[0], parts[1]
 
 
 def _quotient(exponentials: Sequence[Array], ab: Array, ac: Array) -> Array:
