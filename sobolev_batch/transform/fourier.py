@@ -191,7 +191,7 @@ def transform_block(
     if exact.is_closed_form:
         values: Complexes = np.empty(block.shape, dtype=settings.stored)
         for part in block.split(_SAMPLES):
-            values[part.place_in(block)] = exact.block_values(lattice, part)
+            values[part.place_in(block)] = exact.exact_values(lattice.points(part)).reshape(part.shape)
         return Transformed(values, 0, "closed form")
     kind = kind or settings.kind_for(surface, lattice)
     whole = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch)

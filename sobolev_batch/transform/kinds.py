@@ -19,12 +19,12 @@ from sobolev_batch.geometry.smooth import Counts, Smooth
 from sobolev_batch.transform.backends import CPU, Backend, compute_on
 from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.faces import FaceArrays
-from sobolev_batch.transform.lattice import Block, FrequencyLattice
+from sobolev_batch.transform.lattice import FrequencyLattice
 from sobolev_batch.transform.nufft import WeightedPoints
 from sobolev_batch.transform.quadrature import RuleUse, assign_rules
 from sobolev_batch.transform.resolution import direct_transform, exact_counts, resolution_of
 from sobolev_batch.transform.rule_errors import loosest_tolerance, weight_masses
-from sobolev_batch.transform.spheres import sphere_block, sphere_transform
+from sobolev_batch.transform.spheres import sphere_transform
 
 # Nodes of a parametrised surface that are made at a time: their temporaries take 4 MB.
 _NODES = 1 << 14
@@ -98,10 +98,6 @@ class SurfaceKind(ABC):
     @abstractmethod
     def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
         """Return the exact transform at frequencies (P, 3), complex128 (P,). Threads and a backend may help."""
-
-    def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
-        """Return the transform of a closed form on a block of a lattice, complex128 (block.shape)."""
-        raise TypeError(f"{type(self).__name__} has no closed form")
 
     def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
         """Return the largest tolerance of points whose error is predicted to have at most some norms (orders,)."""
@@ -227,9 +223,6 @@ class _ClosedForm(SurfaceKind):
 
     def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
         return sphere_transform(self.surface, frequencies)
-
-    def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
-        return sphere_block(self.surface, lattice, block)
 
 
 _KINDS: Mapping[type, type[SurfaceKind]] = {Mesh: _Triangles, Smooth: _Parametrised, Sphere: _ClosedForm}

@@ -11,7 +11,6 @@ from scipy.special import gamma, kv
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import OrderError
 from sobolev_batch.geometry.closed_forms import Sphere
-from sobolev_batch.transform.lattice import Block, FrequencyLattice
 
 # Terms of a series below this fraction of its sum do not count.
 _LEAST_TERM = 1e-17
@@ -28,19 +27,6 @@ def sphere_transform(sphere: Sphere, frequencies: Reals) -> Complexes:
     lengths = np.sqrt(np.einsum("...i,...i->...", frequencies, frequencies))
     phases = np.exp(-2j * np.pi * (frequencies @ np.asarray(sphere.center)))
     return np.asarray(sphere.area * np.sinc(2 * sphere.radius * lengths) * phases)
-
-
-def sphere_block(sphere: Sphere, lattice: FrequencyLattice, block: Block) -> Complexes:
-    """Return the transform of a sphere on a block of the lattice, complex128 (block.shape)."""
-    x, y, z = lattice.frequencies(block)
-    lengths = np.sqrt((x**2)[:, None, None] + (y**2)[:, None] + z**2)
-    values = (sphere.area * np.sinc(2 * sphere.radius * lengths)).astype(np.complex128)
-    center = np.array(sphere.center) if lattice.rotation is None else lattice.rotation @ sphere.center
-    for axis, frequencies in enumerate((x, y, z)):
-        shape = [1, 1, 1]
-        shape[axis] = -1
-        values *= np.exp(-2j * np.pi * center[axis] * frequencies).reshape(shape)
-    return values
 
 
 def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:

@@ -13,7 +13,7 @@ import pytest
 from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
 from sobolev_batch.shapes import Ellipsoid, Sphere, Torus, icosphere
 from sobolev_batch.transform.lattice import SobolevWeights, shell_sums
-from sobolev_batch.transform.spheres import sphere_block
+from sobolev_batch.transform.spheres import sphere_transform
 from tests.support.repository import ROOT
 
 FIGURE_1B = {
@@ -41,7 +41,8 @@ def test_figure_1b_trapezoidal_rule_for_the_sphere(intervals: int) -> None:
     exact = norm(Sphere(), [-5.0, -10.0])["norm"].values ** 2
     # Sums of the closed form: with M = 16 the sphere is larger than the period, which `fourier_transform` refuses.
     lattice = Lattice(5.0, intervals)
-    sums = shell_sums(sphere_block(Sphere(), lattice, lattice.half), None, lattice, lattice.half)
+    field = sphere_transform(Sphere(), lattice.points(lattice.half)).reshape(lattice.shape)
+    sums = shell_sums(field, None, lattice, lattice.half)
     computed = SobolevWeights(lattice, (-5.0, -10.0)).per_shell @ sums
     errors = np.abs(exact - computed) / exact
     for error, expected in zip(errors, FIGURE_1B[intervals], strict=True):

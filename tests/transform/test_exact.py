@@ -8,12 +8,12 @@ import mpmath
 import numpy as np
 import pytest
 
-from sobolev_batch import Lattice, Mesh, norm
+from sobolev_batch import Mesh, norm
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import OrderError
 from sobolev_batch.shapes import Sphere
 from sobolev_batch.transform.exact import exact_transform
-from sobolev_batch.transform.spheres import sphere_block, sphere_inner_product, sphere_transform
+from sobolev_batch.transform.spheres import sphere_inner_product
 
 
 def oracle(corners: Reals, frequency: Reals) -> complex:
@@ -125,12 +125,6 @@ def radial_integral(first: Sphere, second: Sphere, order: float) -> float:
 @pytest.mark.parametrize("order", [-7.25, -10.0, -79.5, -100.0])
 def test_inner_products_against_the_radial_integral(first: Sphere, second: Sphere, order: float) -> None:
     assert sphere_inner_product(first, second, order) == pytest.approx(radial_integral(first, second, order), rel=1e-12)
-
-
-def test_block_and_pointwise_transform_agree() -> None:
-    lattice, sphere = Lattice(2.0, 8), Sphere(0.7, (0.1, -0.2, 0.3))
-    grid = np.stack(np.meshgrid(*lattice.axes, indexing="ij"), axis=-1)
-    assert np.allclose(sphere_block(sphere, lattice, lattice.half), sphere_transform(sphere, grid), rtol=0, atol=1e-14)
 
 
 def test_says_when_its_functions_overflow() -> None:
