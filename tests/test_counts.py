@@ -23,6 +23,7 @@ from sobolev_batch.sources import files
 from sobolev_batch.sources.command import CommandSource
 from sobolev_batch.tables.other_orders import convergence_at
 from sobolev_batch.transform import kinds
+from sobolev_batch.transform.exact import exact_transform
 from tests.support.commands import call, write_toml
 from tests.support.studies import SMALL_LATTICE, small_table
 
@@ -133,7 +134,7 @@ def work_of(call: Callable[[], object]) -> dict[str, int]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finufft, "Plan", Plan)
-        patch.setattr(kinds, "exact_transform", counting(kinds.exact_transform))
+        patch.setattr(kinds, "exact_transform", counting(exact_transform))
         call()
     return {name: sum(count for kind, count in events if kind == name) for name in ("transforms", "points", "exact")}
 
