@@ -86,7 +86,9 @@ class Status(Shown):
         if self.run is not None and self.run.state == "submitted":
             parts.append("no worker has taken it up yet")
         elif self.waiting == 0:
-            parts.append(self.run.stage if self.run is not None else "")
+            # A run tells its stage now and then, and its last fields may be stored since.
+            stage = self.run.stage if self.run is not None and self.going_on else ""
+            parts.append("tables follow" if "fields, " in stage else stage)
         elif math.isnan(self.seconds_left):
             parts.append("time left not known yet" if self.going_on else "")
         else:

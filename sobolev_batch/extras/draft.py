@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from glob import has_magic
 from itertools import chain, product, takewhile
 from pathlib import Path, PurePosixPath
 from string import Template
@@ -331,7 +332,10 @@ def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosix
     wanted = []
     for (_, _, rest), parts in zip(owned, folders, strict=True):
         # With slashes, or the families of a/b and "a b" would be one.
-        wanted.append("/".join(parts[shared:]) or _SIZE.sub("", rest).strip(_BETWEEN) or "".join(parts[-1:]))
+        named = _SIZE.sub("", rest).strip(_BETWEEN)
+        # Numbers alone, as those of dates, are no name.
+        named = named if any(map(str.isalpha, named)) else ""
+        wanted.append("/".join(parts[shared:]) or named or "".join(parts[-1:]))
     families: dict[tuple[str, str], list[PurePosixPath]] = {}
     counts, names = Counter(wanted), dict[str, str]()
     for (name, path, _), parts, family in zip(owned, folders, wanted, strict=True):
@@ -400,13 +404,25 @@ def _one_object(
         ends = dict.fromkeys(f"{end(sizes[member] for member in members):,}" for end in (min, max))
         size = f"{_count(len(members))}, {' to '.join(ends)} triangles"
         paths = "".join(f"    {_json(str(folder / member))},\n" for member in members)
-        sections.append(_filled("family", name=_json(family), paths=paths, size=size))
+        sections.append(
+            _filled("family", name=_json(family), paths=paths, size=size, glob=_glob(members, sizes, folder))
+        )
         summary.append(f"family {family}: {size}")
     if min((sizes[path] for paths in families.values() for path in paths), default=0) >= _AS_FINE * triangles:
         summary.append("are these objects of their own? if so, move them into a folder called originals, and init that")
     if counts:
         sections.append(_filled("optional" if families else "decimated", counts=counts))
     return sections, tuple(summary)
+
+
+def _glob(members: Sequence[PurePosixPath], sizes: Iterable[PurePosixPath], folder: PurePosixPath) -> str:
+    """Return a remark with the glob that matches these files and no others that can be read; nothing without one."""
+    kinds = {(member.parent, member.suffix) for member in members}
+    if len(kinds) > 1 or len(members) != sum((path.parent, path.suffix) in kinds for path in sizes):
+        return ""
+    ((parent, suffix),) = kinds
+    place = str(folder / parent)
+    return "" if has_magic(place) else f"; [{_json(f'{place}/*{suffix}')}] would take new files too"
 
 
 def _originals(

@@ -299,7 +299,8 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
     if name:
         yield Section(f"Object {name}")
     marked = with_remarks(frame)
-    columns = list(_COLUMNS)
+    # Meshes in the order of their names have no rates.
+    columns = [one for one in _COLUMNS if one.name != "rate" or frame["rate"].notna().any()]
     if x not in {column.name for column in columns}:
         columns.insert(2, Column(x, x, "{:.4g}".format))
     for order, rows in marked.groupby("order", sort=False):

@@ -56,7 +56,7 @@ def test_the_time_left_follows_from_the_last_ones_and_what_cannot_be_told_is_not
     assert status.progress == "4 of 5 done, 1 failed, 2 a minute, about 30 s left at this rate"
     for status in (running(store, 0, 10), running(store, 0, 0, 0), running(store, 0, 10, 40, begun=20)):
         assert status.progress.endswith(" of 5 done, 1 failed, time left not known yet")
-    assert running(store, 0, 10, 20, 30, 40).progress == "5 of 5 done, 1 failed, fields, 3 of 5"
+    assert running(store, 0, 10, 20, 30, 40).progress == "5 of 5 done, 1 failed, tables follow"
     assert running(store, state="submitted").progress == "0 of 5 done, 0 failed, no worker has taken it up yet"
 
 

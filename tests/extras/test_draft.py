@@ -216,6 +216,17 @@ def test_originals_alone_are_compared_with_their_decimations(tmp_path: Path, tem
         assert [*one.members] == [*(f"quadric decimation/{count}" for count in (20, 40, 80, 160)), "reference"]
 
 
+def test_names_that_are_dates_are_those_of_a_family_that_new_files_may_join(tmp_path: Path) -> None:
+    for name in ("original.ply", "scans/2026-11-30_01.ply", "scans/2026-11-30_02.ply", "scans/2026-12-01_01.ply"):
+        write(tmp_path / name, 1 + (name == "original.ply"))
+    found = sb.init_study(tmp_path, tmp_path / "study.toml")
+    assert [family.name for family in as_study(found.path).object.families] == ["scans"]
+    assert '["scans/*.ply"] would take new files too' in found.path.read_text(encoding="utf-8")
+    (tmp_path / "original.ply").rename(tmp_path / "scans" / "original.ply")
+    beside = sb.init_study(tmp_path, tmp_path / "beside.toml")
+    assert "would take new files" not in beside.path.read_text(encoding="utf-8")
+
+
 def test_a_folder_called_originals_holds_objects_of_their_own(tmp_path: Path) -> None:
     """Meshes as fine as each other, in another folder, are taken for one object; then the draft asks."""
     for folder, name in product(("scans", "Originals"), ("scan_1", "scan_2")):

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 import sobolev_batch as sb
+from sobolev_batch.tables.convergence import format_table
 from tests.support.studies import small_table, variable
 
 pytestmark = pytest.mark.slow
@@ -44,6 +45,11 @@ def names(folder: Path) -> list[str]:
     return list(table(folder).index)
 
 
+def headers(folder: Path) -> list[str]:
+    """Return the columns of the table for people."""
+    return next(line for line in format_table(store_of(folder)).splitlines() if line.startswith("mesh ")).split()
+
+
 def test_files_go_from_few_triangles_to_many_and_have_rates_unless_a_key_orders_them(folder: Path) -> None:
     (folder / "a0.ply").write_text("no mesh")
     run(folder)
@@ -53,10 +59,12 @@ def test_files_go_from_few_triangles_to_many_and_have_rates_unless_a_key_orders_
     assert frame["rank"].tolist() == [0, 1, 2, 3]
     assert frame["ordered_by"].tolist() == ["triangles"] * 4
     assert frame["rate"].round().tolist()[1:3] == [2, 2]
+    assert "rate" in headers(folder)
     # The key alone makes the tables anew.
     run(folder, order_by="names")
     assert names(folder) == ["a0", "a9", "a10", "b"]
     assert table(folder)["rate"].isna().all()
+    assert "rate" not in headers(folder)
     run(folder)
     assert names(folder) == ["b", "a10", "a9", "a0"]
 
