@@ -71,7 +71,10 @@ def matrix_command(store: Location, style: Format, orders: ChosenOrders) -> None
 @table_command.command("verdict")
 @table_options
 def verdict_command(store: Location, style: Format, orders: ChosenOrders) -> None:
-    """Print the nearest mesh at each size. Also print the smallest below 5 % and 1 %."""
+    """Print the nearest mesh at each size. Also print the smallest below 5 % and 1 %.
+
+    More than three objects have a line each, the worst first; for one of them, name STORE/OBJECT.
+    """
     from sobolev_batch.tables.conclusion import format_verdict
 
     echo_lines(format_verdict(store, style, orders), style)

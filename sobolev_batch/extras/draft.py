@@ -132,8 +132,10 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     if problem := _path_problem(str(below)):
         raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
     sizes, extents, left_out = _look_at(folder)
-    are_all = _REFERENCES.fullmatch(folder.resolve().name) is not None
-    references = _references(sizes, are_all=are_all) or {"": _reference(folder, sizes, left_out)}
+    references = _references(sizes)
+    if not references and _REFERENCES.fullmatch(folder.resolve().name):
+        references = _references(sizes, are_all=True)
+    references = references or {"": _reference(folder, sizes, left_out)}
     families = _families(_without_strangers(sizes, references.get("")), references)
     used = {*references.values(), *chain.from_iterable(families.values())}
     doubts = {

@@ -1,7 +1,9 @@
 """Schema of study files: their sections, keys and limits."""
 
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
@@ -18,6 +20,7 @@ from pydantic_core import PydanticKnownError
 
 from sobolev_batch.arrays import ComplexDtype
 from sobolev_batch.errors import StudyError, refused_by_pydantic
+from sobolev_batch.geometry.formats.by_name import is_mesh_name
 from sobolev_batch.geometry.proximity import DEFAULT_POINTS, METRICS, MOST_POINTS
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
@@ -191,6 +194,8 @@ def with_named_meshes(table: Any, meshes: Mapping[str, Any], above: tuple[str, .
             raise ValueError(f"the mesh {quoted(table)} is made from itself, or from too many others")
         if table not in meshes:
             known = known_names(table, meshes) if meshes else "the study has no section [mesh.NAME]"
+            if is_mesh_name(Path(table)):
+                known += f'; for a file, write {{ source = "files", paths = [{json.dumps(table)}] }}'
             raise ValueError(f"no mesh is named {quoted(table)}; {known}")
         return with_named_meshes(meshes[table], meshes, (*above, table))
     if not isinstance(table, dict):

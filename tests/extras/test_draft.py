@@ -236,6 +236,10 @@ def test_a_folder_called_originals_holds_objects_of_their_own(tmp_path: Path) ->
     assert "objects of their own? if so, move them into a folder called originals, and init that" in str(one)
     assert [*as_study(several.path).objects] == ["scan_1", "scan_2"]
     assert "objects of their own" not in str(several)
+    for name in ("cow.ply", "cow_80.ply", "pig.ply", "pig_80.ply"):
+        write(tmp_path / "objects" / name, 1 + ("_" not in name))
+    with_versions = sb.init_study(tmp_path / "objects", tmp_path / "objects.toml")
+    assert [*as_study(with_versions.path).objects] == ["cow", "pig"]
 
 
 def test_originals_alone_whose_names_follow_no_pattern_need_other_meshes(tmp_path: Path) -> None:

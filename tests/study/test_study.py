@@ -204,6 +204,7 @@ PLACES: list[tuple[str, Any, str]] = [
     ("reference", {"source": "torus", "R": 1.0, "r": 2.0}, r"\[reference\]: .*0 < r < R"),
     ("family", ["files"], r"\[\[family\]\] 1 must be a table"),
     ("family", [{**DECIMATED, "mesh": "a.ply"}], r"no mesh is named 'a.ply'; the study has no section \[mesh.NAME\]"),
+    ("reference", "a b.ply", r'\[mesh.NAME\]; for a file, write \{ source = "files", paths = \["a b.ply"\] \}$'),
     ("family", [{**DECIMATED, "mesh": ["a.ply"]}], "mesh: must be a table that names a source"),
     ("mesh", {"a/b": {"source": "sphere"}}, r"^\[mesh.a/b\]: .*it holds '/'"),
     ("mesh", {"ball": {"source": "sphere", "radius": "x"}}, r"^\[mesh.ball\]: radius must be a number, found 'x'$"),
