@@ -554,7 +554,7 @@ def test_nothing_answers_at_the_scheduler(folder: Path) -> None:
 
 
 # Those of the extras are beside them.
-COMMANDS = "compare export info plan prune run status submit table unlock verify"
+COMMANDS = "compare info plan prune run status submit table unlock verify"
 # Libraries that take long to import.
 NUMERICS = "numpy scipy pandas xarray dask distributed zarr fsspec pydantic matplotlib finufft psutil tabulate"
 HELP = """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
-import warnings
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -21,7 +20,6 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.extras.export import export
 from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
@@ -507,23 +505,6 @@ def test_metadata_may_be_numbers_of_one_object_and_texts_of_another(threads: Cli
     rows = xr.open_dataset(tmp_path / "s.zarr", group="convergence", engine="zarr")
     assert rows["effort"].values.tolist() == ["7.5", "", "high", "", "", "", "8", ""]
     assert sb.table(tmp_path / "s.zarr/a")["effort"].dtype == float
-
-
-def test_metadata_with_blanks_are_exported_without_a_warning_or_a_lock(
-    threads: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("h5netcdf", reason="h5netcdf comes with the extra 'export'")
-    # A lock of a cluster that was may have its name.
-    monkeypatch.setattr("dask.distributed.Lock", None)
-    sb.write_mesh(sb.shapes.icosphere(1), tmp_path / "ball.ply")
-    family = [{"name": "f", "source": "files", "meshes": [{"path": "ball.ply", "my effort": 7.5}]}]
-    study = sb.Study.from_table(small_table(object=balls(a=1.0), family=family), folder=tmp_path)
-    sb.run(study, tmp_path / "s.zarr", threads)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        export(tmp_path / "s.zarr", tmp_path / "t.nc", "netcdf")
-    with xr.open_dataset(tmp_path / "t.nc", group="a/convergence", engine="h5netcdf") as rows:
-        assert rows["my effort"].values[0] == 7.5
 
 
 def test_a_run_that_was_killed_before_the_tables_of_all_goes_on(

@@ -213,7 +213,6 @@ PLACES: list[tuple[str, Any, str]] = [
     ("mesh", {"a": 3, "b": {"mesh": "a"}}, r"^\[mesh.a\] must be a table, found 3; \[mesh.b\] must be a table"),
     ("family", [{**DECIMATED, "mesh": {"source": "files", "path": []}}], r"named 'd'\): mesh.path is unknown; .*paths"),
     ("family", [{**DECIMATED, "mesh": {"paths": ["a.ply"]}}], "source is missing"),
-    ("family", [{"name": "f", "source": "fit"}], r"mesh is missing; give one, such as mesh = \{ source = "),
     ("reference.radius", 1 << 2000, "reference.radius: an integer of TOML has 64 bits, found an integer of 2001 bits"),
     ("study.mesh", "ball", r"\[study\]: mesh is unknown; known are name, title"),
     ("family", [{"name": "d", "source": "decimate", "within": True}], "within must be a number or text.*, found true"),

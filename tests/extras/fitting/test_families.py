@@ -51,6 +51,12 @@ def test_a_study_fits_to_its_reference_and_reuses_what_it_has(client: Client, tm
     assert sb.run(other, store=tmp_path / "store.zarr", client=client).computed == ("fitted/1", "fitted/2")
 
 
+@pytest.mark.parametrize("source", ["fit", "refine"])
+def test_what_to_begin_with_has_no_default(source: str) -> None:
+    with pytest.raises(sb.errors.StudyError, match=r"mesh is missing; give one, such as mesh = \{ source = "):
+        sb.Study.from_table({**table(), "family": [{"name": "f", "source": source}]})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "make"),
