@@ -14,8 +14,9 @@ product" (2005), doi:10.1137/030601818. That is valid without over- and underflo
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice, product
 
 import numpy as np
 
@@ -87,23 +88,17 @@ def _in_loops(mesh: Mesh, doubled: Reals, frequencies: Reals, threads: int) -> C
 
     parts = np.array_split(frequencies, threads if len(frequencies) >= _FEWEST_PER_THREAD * threads else 1)
     # Sums of sums round less often.
-    faces = list(mesh.batches(_COMPILED_BATCH))
+    batches = list(mesh.batches(_COMPILED_BATCH))
 
-    def over_faces(part: Reals) -> Iterator[Complexes]:
+    def of_part(part: Reals, number: int, batch: Mesh) -> Complexes:
         rows = np.pad(part, ((0, -len(part) % _VECTOR), (0, 0)), mode="edge").T.copy()
-
-        def of_batch(numbered: tuple[int, Mesh]) -> Complexes:
-            number, batch = numbered
-            areas = doubled[number * _COMPILED_BATCH :][: len(batch.triangles)]
-            return exact_sums(batch.vertices, batch.triangles, areas, rows)[: len(part)]
-
-        return each(of_batch, faces)
+        areas = doubled[number * _COMPILED_BATCH :][: len(batch.triangles)]
+        return exact_sums(batch.vertices, batch.triangles, areas, rows)[: len(part)]
 
     with ThreadPoolExecutor(threads) as pool:
-        each = pool.map if threads > 1 and len(parts) * len(faces) > 1 else map
-        found = [over_faces(part) for part in parts]
-        totals = [sum(of_part, np.zeros(len(part), np.complex128)) for of_part, part in zip(found, parts, strict=True)]
-    return np.concatenate(totals)
+        found = pool.map(lambda task: of_part(task[0], *task[1]), product(parts, batches))
+        none = (np.zeros(len(part), np.complex128) for part in parts)
+        return np.concatenate([sum(islice(found, len(batches)), start) for start in none])
 
 
 def _sums(faces: tuple[Array, ...], frequencies: Reals, reach: float, longest: float) -> Array:
