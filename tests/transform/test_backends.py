@@ -252,7 +252,8 @@ def test_the_processor_computes_exact_transforms_where_a_gpu_fails(
     monkeypatch.setattr(exact, "_FEWEST_FOR_GPU", 1)
     mesh, frequencies = icosphere(3), np.full((32, 3), 1.5)
     found = exact_transform(mesh, frequencies, Device(capacity=1e4).backend())
-    assert np.array_equal(found, exact_transform(mesh, frequencies))
+    # Whether this takes compiled loops, depends on what the process computed before.
+    assert np.abs(found - exact_transform(mesh, frequencies)).max() < 1e-13 * mesh.area
     assert "the GPU fails: Out of memory" in caplog.text
 
 
