@@ -315,9 +315,9 @@ def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
 
 
 def without_shared_triangles(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
-    """Return one surface, or two without the triangles that both have, by their signs in the difference."""
+    """Return one surface, or two without the triangles that both have, by their signs; nothing of equal formulas."""
     if not (meshes := two_meshes(surfaces)):
-        return dict(zip((1, -1), surfaces, strict=False))
+        return {} if surfaces[:1] == surfaces[1:] else dict(zip((1, -1), surfaces, strict=False))
     shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
     if shared[0].any():
         meshes = [

@@ -176,6 +176,13 @@ def test_equal_meshes_have_the_distance_zero(client: Client, store_path: Path) -
     assert (pair["error"] < 1e-6).all()
 
 
+def test_a_reference_by_formula_is_certain_to_be_itself(octave_store: Path) -> None:
+    itself = sb.open_store(octave_store)["convergence"].to_dataset().sel(mesh="reference")
+    assert (itself["distance"] == 0).all()
+    assert (itself["error"] == 0).all()
+    assert itself["within"].all()
+
+
 def test_fields_in_blocks_and_octaves_in_a_task_of_their_own_are_the_same(client: Client, tmp_path: Path) -> None:
     # Small chunks: several blocks, and a task for the octaves of each mesh.
     table = {**BEYOND, "family": [{"name": "ico", "source": "icosphere", "levels": [2]}]}

@@ -88,8 +88,6 @@ def relative_distance(
     the first lattice, if that leaves the answer open. The memory of the accuracy counts, and its rtol does not. Return
     the bounds, and what they follow from. LatticeError where a surface is too large or too small for any lattice.
     """
-    if surface == reference:
-        return Interval(0.0, 0.0), "identical"
     accuracy = replace(accuracy, rtol=_FIRST_RTOL, best_effort=True)
     pair, settings = (surface, reference), ((order,), accuracy, "the relative distance", threads)
     problem, first = Problem.from_surfaces(pair, *settings, most_clipped=_MOST_CLIPPED), None

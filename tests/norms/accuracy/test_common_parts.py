@@ -123,6 +123,15 @@ def test_edits_far_apart_on_one_part_are_no_surfaces_far_apart() -> None:
     assert problem.apart is None
 
 
+@pytest.mark.parametrize("formula", [sb.shapes.Sphere(0.7), sb.shapes.Ellipsoid((1.0, 0.8, 0.6))])
+def test_equal_formulas_differ_by_nothing_for_certain(formula: sb.shapes.Sphere | sb.shapes.Ellipsoid) -> None:
+    found = sb.distance(formula, replace(formula), [-1.5, -4.0], rtol=0.1)
+    assert (found["distance"] == 0).all()
+    assert (found["error"] == 0).all()
+    assert found["within"].all()
+    assert sb.testing.same_surface(formula, replace(formula)).method == "identical"
+
+
 def test_equal_surfaces_are_equal_in_any_triangles() -> None:
     first, second = part_and_edited()
     assert are_equal(first, turned(cut_anew(BOX.mesh(), 5)))
