@@ -15,8 +15,10 @@ from distributed import Client
 from scipy.integrate import dblquad
 
 import sobolev_batch as sb
-from sobolev_batch.store.layout import Store
+from sobolev_batch.store.layout import Store, stored_choice
+from sobolev_batch.study.plan import make_plan
 from sobolev_batch.transform.spheres import sphere_inner_product
+from tests.support.rectangles import Rectangles
 from tests.support.stores import delete, flip, put_back, truncate
 from tests.support.studies import small_table, variable
 
@@ -181,6 +183,50 @@ def test_a_reference_by_formula_is_certain_to_be_itself(octave_store: Path) -> N
     assert (itself["distance"] == 0).all()
     assert (itself["error"] == 0).all()
     assert itself["within"].all()
+
+
+@pytest.mark.parametrize(("count", "other"), [(5, 7), (6, 6)])
+def test_numbers_to_a_loose_accuracy_hold_for_faces_that_repeat_beyond_the_lattice(
+    threads: Client, tmp_path: Path, count: int, other: int
+) -> None:
+    width = 0.6 if count < other else 0.8
+    parts = {
+        "reference": Rectangles.fins(count, width),
+        "fins/moved": Rectangles.fins(other, width).moved(0, 0, 0.3 / other),
+        "fins/dense": Rectangles.fins(17, width),
+    }
+    for label, part in parts.items():
+        sb.write_mesh(part.mesh(), tmp_path / f"{Path(label).name}.ply")
+    table = small_table(
+        accuracy={"rtol": 0.1},
+        lattice=None,
+        norm={"orders": [-1.5]},
+        scaling={"mode": "none"},
+        reference={"source": "files", "paths": ["reference.ply"]},
+        family=[{"name": "fins", "source": "files", "paths": ["moved.ply", "dense.ply"]}],
+    )
+    sb.run(sb.Study.from_table(table, folder=tmp_path), tmp_path / "store.zarr", threads)
+    tree = sb.open_store(tmp_path / "store.zarr")
+    assert variable(tree, "convergence", "within").all()
+    norms, pairs = (tree[group].to_dataset().squeeze("order") for group in ("norms", "distances"))
+    nothing = Rectangles(np.zeros((0, 3)), np.zeros((0, 3)))
+    for label, part in parts.items():
+        found = norms.sel(mesh=label)
+        assert abs(found["norm"].item() - part.distance(nothing, [-1.5]).item()) <= found["error"].item()
+    for (one, first), (two, second) in combinations(parts.items(), 2):
+        found = pairs.sel(mesh=one, other=two)
+        assert abs(found["distance"].item() - first.distance(second, [-1.5]).item()) <= found["error"].item()
+
+
+def test_what_pilots_choose_is_enough_for_them(threads: Client, store_path: Path) -> None:
+    family = [{"name": "ico", "source": "icosphere", "levels": [1, 2, 3]}]
+    study = sb.Study.from_table(asking(0.1) | {"norm": {"orders": [-2.0]}, "family": family})
+    planned = make_plan(study).choice
+    sb.run(study, store_path, threads)
+    stored = stored_choice(store_path)
+    assert stored is not None
+    assert stored.lattice == planned.lattice
+    assert variable(sb.open_store(store_path), "convergence", "within").all()
 
 
 def test_fields_in_blocks_and_octaves_in_a_task_of_their_own_are_the_same(client: Client, tmp_path: Path) -> None:

@@ -204,18 +204,19 @@ class State:
     @property
     def excess(self) -> float:
         """Error of the remainder over the permitted one, at the worst order; most likely more where it is not known."""
+        # Without octaves, the lattice of others ends sharply, and all of the remainder is an error.
+        of_others = _OF_OTHERS if self.octaves else 1.0
         if not self.remainders[-1].is_known:
             energies = [self.core.energy, *(octave.sums.energy for octave in self.octaves)]
             growth = energies[-1] / energies[-2] if self.octaves and energies[-2] > 0 else 1.0
             expected = self.expected * np.clip(_OF_GROWTH * growth, 1.0, _GROWTH)
             permitted = _REMAINDER_FRACTION * self._permitted_of(self.squares + expected)
             with np.errstate(divide="ignore"):
-                return float(np.max(_OF_OTHERS * expected / permitted))
+                return float(np.max(of_others * expected / permitted))
         values, errors = self.remainders[-1].at(self.problem.orders)
         if self.for_others:
-            errors = np.maximum(errors, _OF_OTHERS * np.abs(values))
-        is_alone = len(self.problem.surfaces) == 1 and not self.octaves
-        fraction = _ALONE_FRACTION if is_alone and not self.for_others else _REMAINDER_FRACTION
+            errors = np.maximum(errors, of_others * np.abs(values))
+        fraction = _ALONE_FRACTION if len(self.problem.surfaces) == 1 and not self.octaves else _REMAINDER_FRACTION
         return float(np.max(errors / (fraction * self.permitted)))
 
     @cached_property
@@ -285,8 +286,7 @@ def solution_of(state: State) -> Solution:
     of_octaves = [values.error_norms(core.weights.orders) for octave in state.octaves for values in octave.values]
     errors = np.asarray(np.hypot.reduce([core.errors, *of_octaves]))
     found = estimate_norms(core.sums, core.weights, support, errors, state.tail)
-    in_octaves = [octave.values for octave in state.octaves]
-    values = [SurfaceValues(field, tuple(one[n] for one in in_octaves)) for n, field in enumerate(core.fields)]
+    values = [SurfaceValues(own, tuple(one.values[n] for one in state.octaves)) for n, own in enumerate(core.fields)]
     return Solution(found, core.weights.lattice, tuple(values), remainders=state.remainders)
 
 
@@ -296,7 +296,9 @@ def farther_out(state: State) -> State | None:
     For others, what lies beyond is first looked at where the energy of the last octave permits that it is enough.
     """
     problem, beyond = state.problem, state.remainders[-1]
-    if state.excess <= 1 or state.seconds >= _MOST_SECONDS:
+    # The law that extrapolates from a lattice alone does not hold for flat faces.
+    needs_octave = state.for_others and bool(state.normals) and not state.octaves
+    if (state.excess <= 1 and not needs_octave) or state.seconds >= _MOST_SECONDS:
         return _looked_at(state)
     octave = Octave(state.cutoff, len(state.octaves) + 1)
     smooth = max((surface.area for surface in problem.surfaces if isinstance(surface, Smooth)), default=0.0)
