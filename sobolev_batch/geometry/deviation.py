@@ -36,7 +36,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.cover import cover_distances
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
-from sobolev_batch.geometry.mesh import Mesh, cross, dot
+from sobolev_batch.geometry.mesh import Mesh, dot
 from sobolev_batch.geometry.overlap import ROUNDING, rests_of
 from sobolev_batch.geometry.surface import is_finite_number
 
@@ -54,10 +54,6 @@ _BATCH, _MOST_PIECES = 1 << 15, 100_000_000
 _MANY, _MANY_OF_EACH = 1 << 17, 2
 # A plane that cuts off less of the sides than these fractions leaves slivers, and the piece is cut in two.
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
-# The distance is steep where the square of its change along a side exceeds the square of the side over this.
-_STEEP = 4.0
-# Largest square of a change across a thin triangle over that of its width: its short side may be oblique.
-_ACROSS = 4.0
 # For so many pieces, with the farthest centers, the closest triangle to the worst corner, and covers, are searched.
 _FEW = 300
 
@@ -346,7 +342,7 @@ def _parts(
     of_pairs = _bounds_of_pairs(corners[..., halved], distances[:, halved], best[halved], second[halved], other, bounds)
     is_done = of_pairs <= bounds.enough
     bounds.upper, halved = max(bounds.upper, of_pairs[is_done].max(initial=0.0)), halved[~is_done]
-    parts += _halves(corners[..., halved], distances[:, halved], bounds)
+    parts += _halves(corners[..., halved])
     near, far = np.stack([best, best]), np.stack([likely, best])
     is_lone = is_beyond[turned[0], pieces]
     alone, beside = np.where(is_lone, far, near)[:, is_cut], np.where(is_lone, near, far)[:, is_cut]
@@ -407,20 +403,10 @@ def _beside_plane(a: Reals, b: Reals, c: Reals, shares: Reals) -> list[Reals]:
     return [np.stack(part) for part in ((a, along_b, along_c), (along_b, b, c), (along_b, c, along_c))]
 
 
-def _halves(corners: Reals, distances: Reals, bounds: _Bounds) -> list[Reals]:
-    """Return triangles (3, 3, n) cut at the middles of their longest sides: thin ones become less so.
-
-    Within a thin wall the distance changes across thin triangles, and not along them. Where it is steep, and its change
-    is what is too much, the side along which it changes most is cut; but if it changes by more than the width permits,
-    it changes along the triangle.
-    """
-    lengths, changes = (np.roll(values, -1, axis=0) - values for values in (corners, distances))
-    squares, changes = np.stack([dot(side, side) for side in lengths]), changes**2
-    is_steep = (_STEEP * changes > squares).any(axis=0)
-    is_steep &= changes.max(axis=0) >= np.maximum(distances.max(axis=0) - bounds.enough, bounds.rounding) ** 2
-    across = np.stack(cross(lengths[0], lengths[1]))
-    is_steep &= changes.max(axis=0) * squares.max(axis=0) <= _ACROSS * dot(across, across)
-    first, which = np.where(is_steep, changes, squares).argmax(axis=0), np.arange(corners.shape[2])
+def _halves(corners: Reals) -> list[Reals]:
+    """Return triangles (3, 3, n) cut at the middles of their longest sides: thin ones become less so."""
+    lengths = np.stack([dot(side, side) for side in np.roll(corners, -1, axis=0) - corners])
+    first, which = lengths.argmax(axis=0), np.arange(corners.shape[2])
     a, b, c = (corners[(first + k) % 3, :, which].T for k in range(3))
     middle = (a + b) / 2
     return [np.stack(part) for part in ((a, middle, c), (middle, b, c))]
