@@ -173,7 +173,9 @@ class Mesh:
     @cached_property
     def used_vertices(self) -> Indices:
         """Indices of the vertices that triangles use, in ascending order."""
-        return _frozen(_used(self.triangles, len(self.vertices)))
+        used = np.zeros(len(self.vertices), dtype=bool)
+        used[self.triangles] = True
+        return _frozen(np.flatnonzero(used).astype(np.int64, copy=False))
 
     @cached_property
     def counts(self) -> dict[str, int]:
@@ -305,9 +307,11 @@ class Mesh:
         for number, batch in enumerate(slices(len(self.triangles), size)):
             if not np.any(self.areas[batch] > 0):
                 continue
-            triangles = self.triangles[batch]
-            used = _used(triangles, len(self.vertices))
-            new_indices[used] = np.arange(len(used))
+            # Without a look at all vertices, since there may be thousands of batches: the last corner at each vertex.
+            triangles, corners = self.triangles[batch], self.triangles[batch].ravel()
+            new_indices[corners] = numbers = np.arange(len(corners))
+            used = corners[new_indices[corners] == numbers]
+            new_indices[used] = numbers[: len(used)]
             yield number, Mesh.from_checked(self.vertices[used], new_indices[triangles])
 
     @cached_property
@@ -411,12 +415,6 @@ def _aspect_ratios(edges: _Edges) -> Reals:
     products = lengths.max(axis=1) * lengths.sum(axis=1)
     flat = np.full_like(products, np.inf)
     return np.asarray(np.divide(products, 2 * np.sqrt(3) * twice_areas, out=flat, where=twice_areas > 0))
-
-
-def _used(triangles: Indices, vertex_count: int) -> Indices:
-    used = np.zeros(vertex_count, dtype=bool)
-    used[triangles] = True
-    return np.flatnonzero(used).astype(np.int64, copy=False)
 
 
 def merge_coincident(vertices: NDArray[Any], triangles: Indices) -> tuple[NDArray[Any], Indices]:

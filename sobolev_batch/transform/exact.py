@@ -41,6 +41,8 @@ _PLAIN_CYCLES = 16.0
 _FLATNESS = 2.5e-2
 # Triangles at a time, and those in compiled loops: temporaries, and exponentials at vertices, stay in cache.
 _BATCH, _COMPILED_BATCH = 1 << 13, 1 << 12
+# Batches of compiled loops in memory for each thread.
+_AT_A_TIME = 16
 # Most pairs of a triangle and a frequency at a time, and most triangles: temporaries stay small.
 _PAIRS = {"cpu": 1 << 14, "gpu": 1 << 22}
 # With fewer pairs a GPU takes longer than compiled loops on the processor.
@@ -88,7 +90,7 @@ def _in_loops(mesh: Mesh, doubled: Reals, frequencies: Reals, threads: int) -> C
 
     parts = np.array_split(frequencies, threads if len(frequencies) >= _FEWEST_PER_THREAD * threads else 1)
     # Sums of sums round less often.
-    batches = list(mesh.batches(_COMPILED_BATCH))
+    batches, totals = mesh.batches(_COMPILED_BATCH), [np.zeros(len(part), dtype=np.complex128) for part in parts]
 
     def of_part(part: Reals, number: int, batch: Mesh) -> Complexes:
         rows = np.pad(part, ((0, -len(part) % _VECTOR), (0, 0)), mode="edge").T.copy()
@@ -96,9 +98,13 @@ def _in_loops(mesh: Mesh, doubled: Reals, frequencies: Reals, threads: int) -> C
         return exact_sums(batch.vertices, batch.triangles, areas, rows)[: len(part)]
 
     with ThreadPoolExecutor(threads) as pool:
-        found = pool.map(lambda task: of_part(task[0], *task[1]), product(parts, batches))
-        none = (np.zeros(len(part), np.complex128) for part in parts)
-        return np.concatenate([sum(islice(found, len(batches)), start) for start in none])
+        # Few copies of triangles are in memory.
+        while group := list(islice(batches, _AT_A_TIME * threads)):
+            found = pool.map(lambda task: of_part(task[0], *task[1]), product(parts, group))
+            for total in totals:
+                for sums in islice(found, len(group)):
+                    total += sums
+    return np.concatenate(totals)
 
 
 def _sums(faces: tuple[Array, ...], frequencies: Reals, reach: float, longest: float) -> Array:
