@@ -220,7 +220,7 @@ def test_a_mesh_beyond_the_pilots_has_its_place_in_the_lattice_and_wrong_ones_ha
     plan = sb.plan(study(folder), folder / "s.zarr")
     assert plan.object.lattice.half_period > 1.5
     assert (set(plan.object.failing), set(plan.object.doubtful)) == ({"f/broken"}, {"f/inches"})
-    assert "failing:       f/broken: " in str(plan)
+    assert "failing:       f/broken:" in str(plan)
     assert "doubtful:      f/inches: its extent is 25.4 times that" in str(plan)
     for name in ("x", "y", "z", "large"):
         (folder / f"{name}.off").unlink()
