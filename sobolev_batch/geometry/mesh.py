@@ -29,6 +29,8 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _ALL = slice(None)
 # Triangles that are measured or sorted at a time: their edges and temporaries stay in cache.
 _BATCH = 1 << 14
+# For so many vertices a corner, marks on all of them take longer than one on each corner.
+_MANY = 16
 # Twice the rounding error of a cross product, relative to the squared longest edge: a smaller area is as good as zero.
 _AREA_RESOLUTION = 8 * np.finfo(np.float64).eps
 # Rounding to single precision along all axes, relative to the largest coordinate, with some margin.
@@ -173,9 +175,7 @@ class Mesh:
     @cached_property
     def used_vertices(self) -> Indices:
         """Indices of the vertices that triangles use, in ascending order."""
-        used = np.zeros(len(self.vertices), dtype=bool)
-        used[self.triangles] = True
-        return _frozen(np.flatnonzero(used).astype(np.int64, copy=False))
+        return _frozen(_used(self.triangles, len(self.vertices)))
 
     @cached_property
     def counts(self) -> dict[str, int]:
@@ -307,11 +307,14 @@ class Mesh:
         for number, batch in enumerate(slices(len(self.triangles), size)):
             if not np.any(self.areas[batch] > 0):
                 continue
-            # Without a look at all vertices, since there may be thousands of batches: the last corner at each vertex.
             triangles, corners = self.triangles[batch], self.triangles[batch].ravel()
-            new_indices[corners] = numbers = np.arange(len(corners))
-            used = corners[new_indices[corners] == numbers]
-            new_indices[used] = numbers[: len(used)]
+            if len(corners) * _MANY > len(self.vertices):
+                used = _used(triangles, len(self.vertices))
+            else:
+                # Of the corners at each vertex the last one, without a look at all vertices.
+                new_indices[corners] = numbers = np.arange(len(corners))
+                used = corners[new_indices[corners] == numbers]
+            new_indices[used] = np.arange(len(used))
             yield number, Mesh.from_checked(self.vertices[used], new_indices[triangles])
 
     @cached_property
@@ -415,6 +418,12 @@ def _aspect_ratios(edges: _Edges) -> Reals:
     products = lengths.max(axis=1) * lengths.sum(axis=1)
     flat = np.full_like(products, np.inf)
     return np.asarray(np.divide(products, 2 * np.sqrt(3) * twice_areas, out=flat, where=twice_areas > 0))
+
+
+def _used(triangles: Indices, vertex_count: int) -> Indices:
+    used = np.zeros(vertex_count, dtype=bool)
+    used[triangles] = True
+    return np.flatnonzero(used).astype(np.int64, copy=False)
 
 
 def merge_coincident(vertices: NDArray[Any], triangles: Indices) -> tuple[NDArray[Any], Indices]:
