@@ -299,7 +299,7 @@ def test_damage_is_what_an_original_has_not(spoiled: Callable[..., Any], told: t
 
 @pytest.mark.parametrize("size", [64, 5000])
 def test_batches_have_the_triangles_of_the_mesh_and_the_vertices_that_these_use(size: int) -> None:
-    mesh = sb.shapes.icosphere(5)
+    mesh = icosphere(5)
     batches = [batch for _, batch in mesh.batches(size)]
     assert np.array_equal(
         np.concatenate([one.vertices[one.triangles] for one in batches]), mesh.vertices[mesh.triangles]
