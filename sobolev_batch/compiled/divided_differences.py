@@ -22,7 +22,7 @@ _FACTORS = np.array([(-1) ** (n // 2) / math.factorial(n + 2) for n in range(20)
 # See `sobolev_batch.transform.exact`.
 _LEAST_PRODUCT = 2e-3
 # Gaps below this (radians) at all frequencies are for the series: the square, over that of a turn.
-_FINE = (1 / _TURN) ** 2
+_FINE_SQUARE = (1 / _TURN) ** 2
 # Frequencies at a time: the exponentials at some thousand vertices stay in a processor's cache.
 _LANES = 32
 # Splits a double into halves of 26 bits each.
@@ -155,7 +155,7 @@ def exact_sums(vertices: Reals, triangles: Indices, doubled: Reals, frequencies:
         for i in range(len(triangles)):
             a, b, c = triangles[i]
             edges, area, thin = _edges(vertices, triangles[i]), doubled[i], 0
-            if _longest_square(edges) * highest < _FINE:
+            if _longest_square(edges) * highest < _FINE_SQUARE:
                 for f in range(len(u)):
                     ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
                     cosine, sine = _cosine_and_sine((bc - ab) / (3 * _TURN))

@@ -32,7 +32,7 @@ from sobolev_batch.sources.programs import Cost
 MOST_ENTRIES, _MOST_TIMES = 1000, 100_000
 
 _EXAMPLE = '{ source = "files", paths = ["a.ply"] }'
-# What a mesh that is missing may be.
+# How to give a mesh that is missing.
 MESH_HINT = f"give one, such as mesh = {_EXAMPLE}"
 
 _HERE = "sobolev_batch.sources"
@@ -374,7 +374,7 @@ OtherSource = Annotated[SerializeAsAny[Source], BeforeValidator(_parse_nested)]
 
 
 class _OfReference(Source):
-    """What stands for the reference of a study until that is known."""
+    """A stand-in for the reference of a study until that is known."""
 
     def with_reference(self, reference: Source) -> Source:
         return reference

@@ -65,12 +65,13 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU, thre
     and compiled loops change the last digits; threads, which these loops take, do not.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
-    pairs, doubled, longest = len(mesh.triangles) * len(frequencies), doubled_areas(mesh), mesh.edge_length_range[1]
+    pairs, doubled = len(mesh.triangles) * len(frequencies), doubled_areas(mesh)
     if backend is CPU and pays(_PAIR_SECONDS * pairs):
         return _in_loops(mesh, doubled, frequencies, threads)
 
     def sums(backend: Backend) -> Complexes:
         total, size = np.zeros(len(frequencies), dtype=np.complex128), _PAIRS[backend.name]
+        longest = mesh.edge_length_range[1]
         for number, batch in mesh.batches(size):
             corners, areas = np.ascontiguousarray(batch.triangles.T), doubled[number * size :][: len(batch.triangles)]
             a, b, c = np.moveaxis(batch.vertices.T[:, corners], 1, 0)

@@ -13,7 +13,7 @@ import pytest
 from sobolev_batch import Mesh, distance, norm
 from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.geometry.subdivision import subdivided
-from sobolev_batch.norms.accuracy import problem
+from sobolev_batch.norms.accuracy import frequencies, problem
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.study.plan import make_plan
@@ -225,3 +225,18 @@ def test_images_that_a_step_lets_in_are_an_error() -> None:
     exact, found = norm(Sphere(100.0), -2.0), norm(Sphere(100.0), -2.0, rtol=1e-2, memory="305MB")
     assert found.attrs["M"] < 64
     assert abs(found["norm"] - exact["norm"]) <= found["error"]
+
+
+def test_what_lies_beyond_the_octaves_of_a_distance_is_estimated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimated: list[tuple[int, float]] = []
+
+    def counted(surfaces: Any, signs: Any, cutoff: float, *others: Any, **settings: Any) -> Remainder:
+        estimated.append((len(surfaces), cutoff))
+        return remainder(surfaces, signs, cutoff, *others, **settings)
+
+    for module in (problem, frequencies):
+        monkeypatch.setattr(module, "remainder", counted)
+    found = distance(icosphere(1), Sphere(), -1.5, rtol=1e-2)
+    of_pair = [cutoff for count, cutoff in estimated if count == 2]
+    assert max(of_pair) == found.attrs["highest_frequency"]
+    assert len(of_pair) == len({*of_pair})
