@@ -50,7 +50,7 @@ def measure_typical_errors(rule: TriangleRule) -> tuple[Reals, Reals]:
 def _errors(rule: TriangleRule, phases: Reals) -> Complexes:
     """Return the error (n,) of a rule on exp(i phase), relative to the area, from the phases at the corners (3, n)."""
     corners = [(np.cos(one), np.sin(one)) for one in phases]
-    real, imaginary = second_difference(corners, phases[1] - phases[0], phases[2] - phases[0])
+    real, imaginary = second_difference(corners, phases[1] - phases[0], phases[2] - phases[1])
     return np.asarray(rule.weights @ np.exp(1j * (rule.barycentric @ phases)) - 2 * (real + 1j * imaginary))
 
 

@@ -16,13 +16,13 @@ _TURN = 2 * math.pi
 # Taylor coefficients of sin(2πx)/x and cos(2πx) in x²: up to a quarter of a cycle the rest is below 2e-17.
 _SINE = tuple((-1) ** n * _TURN ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(11))
 _COSINE = tuple((-1) ** n * _TURN ** (2 * n) / math.factorial(2 * n) for n in range(12))
-# The series in gaps below `_SERIES_GAP` takes 19 terms (-1)^(n // 2) h_n / (n+2)!.
-_SERIES_GAP = 2.0
-_FACTORS = np.array([(-1) ** (n // 2) / math.factorial(n + 2) for n in range(20)])
+# The series in gaps below this (radians) takes 18 terms i^n h_n / (n+2)!.
+_SERIES_GAP = 1.0
+_FACTORS = np.array([1 / math.factorial(n + 2) for n in range(18)])
 # See `sobolev_batch.transform.exact`.
 _LEAST_PRODUCT = 2e-3
-# Gaps below this (radians) at all frequencies are for the series: the square, over that of a turn.
-_FINE_SQUARE = (1 / _TURN) ** 2
+# Where no gap is as wide at any frequency: the square of the product of edge and frequency.
+_FINE_SQUARE = (_SERIES_GAP / _TURN) ** 2
 # Frequencies at a time: the exponentials at some thousand vertices stay in a processor's cache.
 _LANES = 32
 # Splits a double into halves of 26 bits each.
@@ -58,20 +58,17 @@ def _rest(x: float, x_high: float, u: float, u_high: float) -> Any:
 
 
 @part
-def _series(ab: float, ac: float) -> tuple[float, float]:
-    """Return the sum of i^n h_n / (n+2)!, for h_n = p h_(n-2) + q h_(n-3): the nodes' mean is zero."""
-    lowest = (ab + ac) / -3
-    p = (ab * (ab - ac) + ac * ac) / 3
-    q = lowest * (ab + lowest) * (ac + lowest)
-    before, last, this = 1.0, 0.0, p
-    real, imaginary = _FACTORS[0] + _FACTORS[2] * p, 0.0
-    for n in range(8):
-        before = p * last + q * before
-        imaginary += _FACTORS[2 * n + 3] * before
-        last = p * this + q * last
-        real += _FACTORS[2 * n + 4] * last
-        before, last, this = this, before, last
-    return real, imaginary + _FACTORS[19] * (p * last + q * before)
+def _series(p: float, q: float) -> tuple[float, float]:
+    """Return the sum of i^n h_n / (n+2)!, for h_n = (p + q) h_(n-1) - pq h_(n-2)."""
+    total, product = p + q, p * q
+    even, odd = 1.0, total
+    real, imaginary = _FACTORS[0], _FACTORS[1] * total
+    for n in range(2, 18, 2):
+        even = product * even - total * odd
+        odd = product * odd + total * even
+        real += _FACTORS[n] * even
+        imaginary += _FACTORS[n + 1] * odd
+    return real, imaginary
 
 
 @part
@@ -83,9 +80,8 @@ def _first_difference(a: complex, b: complex, gap: float) -> complex:
 
 
 @part
-def _quotient(a: complex, b: complex, c: complex, ab: float, ac: float) -> complex:
+def _quotient(a: complex, b: complex, c: complex, ab: float, bc: float, ac: float) -> complex:
     """Return the difference quotient of the two first differences that meet across the widest gap."""
-    bc = ac - ab
     of_ab, of_ac, of_bc = _first_difference(a, b, ab), _first_difference(a, c, ac), _first_difference(b, c, bc)
     if abs(ab) >= max(abs(ac), abs(bc)):
         return (of_bc - of_ac) / (1j * ab)
@@ -98,9 +94,8 @@ def _quotient(a: complex, b: complex, c: complex, ab: float, ac: float) -> compl
 def _stable(a: complex, b: complex, c: complex, ab: float, bc: float, ac: float) -> complex:
     """Return the divided difference from the exponentials at the corners, whatever the gaps."""
     if max(abs(ab), abs(bc), abs(ac)) >= _SERIES_GAP:
-        return _quotient(a, b, c, ab, ac)
-    # The exponential at the mean of the nodes, from that at the middle one.
-    return b * complex(*_cosine_and_sine((bc - ab) / (3 * _TURN))) * complex(*_series(ab, ac))
+        return _quotient(a, b, c, ab, bc, ac)
+    return b * complex(*_series(-ab, bc))
 
 
 @part
@@ -157,10 +152,8 @@ def exact_sums(vertices: Reals, triangles: Indices, doubled: Reals, frequencies:
             edges, area, thin = _edges(vertices, triangles[i]), doubled[i], 0
             if _longest_square(edges) * highest < _FINE_SQUARE:
                 for f in range(len(u)):
-                    ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-                    cosine, sine = _cosine_and_sine((bc - ab) / (3 * _TURN))
-                    real, imaginary = _series(ab, ac)
-                    real, imaginary = cosine * real - sine * imaginary, cosine * imaginary + sine * real
+                    ab, bc, _ = _gaps(edges, u[f], v[f], w[f])
+                    real, imaginary = _series(-ab, bc)
                     reals[f] += area * (cosines[b, f] * real - sines[b, f] * imaginary)
                     imaginaries[f] += area * (cosines[b, f] * imaginary + sines[b, f] * real)
                 continue

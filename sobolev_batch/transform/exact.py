@@ -5,7 +5,7 @@ They cost O(triangles) for each frequency: they do not replace the NUFFT, but ra
 The transform of a triangle of area A is 2A times the second divided difference of exp at the nodes -2πi ξ·p_j of its
 corners p_j (Hermite-Genocchi; C. de Boor, "Divided differences", 2005, arXiv:math/0502036). It is a plain sum of the
 exponentials at the corners, which neighbouring triangles share. Where nodes are close, that sum cancels. Then it is a
-power series about the centroid if all three are close, else the difference quotient of first differences across the
+power series about one of them if all three are close, else the difference quotient of first differences across the
 widest gap.
 
 Where digits would be lost, sums and products carry their rounding errors: T. J. Dekker, "A floating-point technique for
@@ -28,8 +28,8 @@ from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, 
 # A number as a rounded value and what it lacks.
 Pair = tuple[Array, Array]
 
-# Gaps below this (radians) go through the series: at most 19 terms, and a fraction of the time of the quotient.
-_SERIES_GAP = 2.0
+# Gaps below this (radians) go through the series: at most 18 terms, and a fraction of the time of the quotient.
+_SERIES_GAP = 1.0
 # Where all gaps are below this, nearly all go through it.
 _FINE = 0.5
 # A product of gaps below this, beside one and the squares of two of them, goes through the stable form: the plain sum
@@ -71,15 +71,16 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU, thre
 
     def sums(backend: Backend) -> Complexes:
         total, size = np.zeros(len(frequencies), dtype=np.complex128), _PAIRS[backend.name]
-        longest = mesh.edge_length_range[1]
+        widest = 2 * np.pi * mesh.edge_length_range[1] * float(np.linalg.norm(frequencies, axis=1).max())
         for number, batch in mesh.batches(size):
-            corners, areas = np.ascontiguousarray(batch.triangles.T), doubled[number * size :][: len(batch.triangles)]
-            a, b, c = np.moveaxis(batch.vertices.T[:, corners], 1, 0)
-            arrays = np.ascontiguousarray(batch.vertices.T), corners, areas, np.stack([b - a, c - b])
-            faces, sizes = tuple(map(backend.upload, arrays)), (float(np.abs(batch.vertices).max()), longest)
-            step = max(1, size // len(batch.triangles))
+            areas, reach = doubled[number * size :][: len(batch.triangles)], float(np.abs(batch.vertices).max())
+            arrays = [batch.vertices.T.copy(), batch.triangles.T.copy(), areas]
+            if widest >= _FINE:
+                a, b, c = np.moveaxis(arrays[0][:, arrays[1]], 1, 0)
+                arrays.append(np.stack([b - a, c - b]))
+            faces, step = [*map(backend.upload, arrays)], max(1, size // len(batch.triangles))
             groups = (frequencies[part] for part in slices(len(frequencies), step))
-            total += np.concatenate([backend.download(_sums(faces, group, *sizes)) for group in groups])
+            total += np.concatenate([backend.download(_sums(faces, group, reach, widest)) for group in groups])
         return total
 
     return compute_on(backend if pairs >= _FEWEST_FOR_GPU else CPU, sums) if pairs else np.zeros(0, np.complex128)
@@ -108,22 +109,27 @@ def _in_loops(mesh: Mesh, doubled: Reals, frequencies: Reals, threads: int) -> C
     return np.concatenate(totals)
 
 
-def _sums(faces: tuple[Array, ...], frequencies: Reals, reach: float, longest: float) -> Array:
-    """Return sums (P,) over faces up to some coordinate and edge.
+def _sums(faces: Sequence[Array], frequencies: Reals, reach: float, widest: float) -> Array:
+    """Return sums (P,) over faces up to some coordinate, with phases at corners that are up to some radians apart.
 
-    They are vertices (3, n), corners (3, m), twice the areas (m,), and two edges (2, 3, m).
+    They are vertices (3, n), corners (3, m), twice the areas (m,) and, unless phases are close, two edges (2, 3, m).
     """
-    vertices, (a, b, c), doubled, edges = faces
-    # Of one edge, of the next, and of both: from the edges, since differences of phases lose what the phases share.
-    first, second = (combine(-2 * np.pi * frequencies, edge) for edge in edges)
-    both, widest = first + second, 2 * np.pi * longest * float(np.linalg.norm(frequencies, axis=1).max())
-    exponentials, parts = cosine_and_sine(_phases(vertices, frequencies, reach)), []
+    (vertices, corners, doubled), (a, b, c) = faces[:3], faces[1]
+    is_plain = reach * float(np.abs(frequencies).sum(axis=1).max()) <= _PLAIN_CYCLES
+    phases, parts = _phases(vertices, frequencies, is_plain), list[Array]()
+    exponentials = cosine_and_sine(phases)
     if widest < _FINE:
-        terms = _by_series([np.take(values, b, axis=1) for values in exponentials], first, both, widest)
+        at_a, at_b, at_c = (np.take(phases, corner, axis=1) for corner in corners)
+        gaps = at_a - at_b, at_c - at_b
+        if not is_plain:
+            gaps = tuple(gap - 2 * np.pi * np.rint(gap / (2 * np.pi)) for gap in gaps)
+        terms = _by_series([np.take(values, b, axis=1) for values in exponentials], *gaps, widest)
         real, imaginary = ((of_pairs * doubled).sum(axis=1) for of_pairs in terms)
         return real + 1j * imaginary
+    # From the edges, since differences of phases lose what the phases share.
+    first, second = (combine(-2 * np.pi * frequencies, edge) for edge in faces[3])
     product = first * second
-    product *= both
+    product *= first + second
     is_close = np.abs(product) < _LEAST_PRODUCT * (1 + first * first + second * second)
     product[is_close] = np.inf
     factors = doubled / product
@@ -140,14 +146,14 @@ def _sums(faces: tuple[Array, ...], frequencies: Reals, reach: float, longest: f
         parts.append(before.sum(axis=1))
     rows, columns = np.nonzero(is_close)
     corners = [[values[rows, corner[columns]] for values in exponentials] for corner in (a, b, c)]
-    terms = second_difference(corners, first[rows, columns], both[rows, columns])
+    terms = second_difference(corners, first[rows, columns], second[rows, columns])
     real, imaginary = (sums_at(rows, doubled[columns] * of_pairs, len(frequencies)) for of_pairs in terms)
     return (real - parts[0]) + 1j * (imaginary - parts[1])
 
 
-def _phases(points: Array, frequencies: Reals, reach: float) -> Array:
-    """Return -2π ξ·p (P, n) at points (3, n) up to a coordinate, in radians; of far ones less some whole cycles."""
-    if reach * float(np.abs(frequencies).sum(axis=1).max()) <= _PLAIN_CYCLES:
+def _phases(points: Array, frequencies: Reals, is_plain: bool) -> Array:
+    """Return -2π ξ·p (P, n) at points (3, n), in radians; those that are not plain lack some whole cycles."""
+    if is_plain:
         return combine(-2 * np.pi * frequencies, points)
     (highs, lows), (high_rates, low_rates) = _halves(points), _halves(frequencies)
     cycles = combine(low_rates, highs) + combine(frequencies, lows)
@@ -158,26 +164,37 @@ def _phases(points: Array, frequencies: Reals, reach: float) -> Array:
     return -2 * np.pi * cycles
 
 
-def second_difference(corners: Sequence[Sequence[Array]], ab: Array, ac: Array) -> Pair:
+def second_difference(corners: Sequence[Sequence[Array]], ab: Array, bc: Array) -> Pair:
     """Return the second divided difference of exp at imaginary nodes iα, iβ, iγ, whatever their gaps.
 
-    Its real and imaginary part (n,) follow from those of the exponentials, and the gaps β - α and γ - α in radians.
+    Its real and imaginary part (n,) follow from those of the exponentials, and the gaps β - α and γ - β in radians.
     """
-    widest = np.maximum(np.maximum(np.abs(ab), np.abs(ac)), np.abs(ac - ab))
+    widest = np.maximum(np.maximum(np.abs(ab), np.abs(bc)), np.abs(ab + bc))
     close = widest < _SERIES_GAP
-    apart, (p, q), (real, imaginary) = ~close, (ab[close], ac[close]), (np.empty_like(ab), np.empty_like(ab))
+    apart, (p, q), (real, imaginary) = ~close, (-ab[close], bc[close]), (np.empty_like(ab), np.empty_like(ab))
     most = float(widest[close].max()) if len(p) else 0.0
     real[close], imaginary[close] = _by_series([part[close] for part in corners[1]], p, q, most)
-    quotients = _quotient([real[apart] + 1j * imaginary[apart] for real, imaginary in corners], ab[apart], ac[apart])
+    quotients = _quotient([real[apart] + 1j * imaginary[apart] for real, imaginary in corners], ab[apart], bc[apart])
     real[apart], imaginary[apart] = quotients.real, quotients.imag
     return real, imaginary
 
 
-def _by_series(middle: Sequence[Array], ab: Array, ac: Array, widest: float) -> Pair:
-    """Return the same for gaps that are all small, from the exponential at the middle node."""
-    cosines, sines = cosine_and_sine((ac - 2 * ab) / 3)
-    real, imaginary = _series(ab, ac, widest)
-    real, imaginary = cosines * real - sines * imaginary, cosines * imaginary + sines * real
+def _by_series(middle: Sequence[Array], p: Array, q: Array, widest: float) -> Pair:
+    """Return the same from the exponential at the middle node, and how far the others are from it: all gaps are small.
+
+    It is Σ_n i^n h_n / (n+2)!, with h_n = (p + q) h_(n-1) - pq h_(n-2) the complete homogeneous symmetric polynomials.
+    """
+    total, product, n = p + q, p * q, 2
+    even, odd, real, imaginary = np.ones_like(p), 1 * total, 0.5, total / 6
+    # |h_n| <= (n + 1) widest^n: stop where a term is below half a rounding error of 1/2.
+    while (n + 1) * widest**n / math.factorial(n + 2) > 2e-17:
+        even *= product
+        even -= total * odd
+        real += even / math.factorial(n + 2)
+        odd *= product
+        odd += total * even
+        imaginary += odd / math.factorial(n + 3)
+        n += 2
     return middle[0] * real - middle[1] * imaginary, middle[0] * imaginary + middle[1] * real
 
 
@@ -200,28 +217,10 @@ def doubled_areas(mesh: Mesh) -> Reals:
     return doubled
 
 
-def _series(ab: Array, ac: Array, widest: float) -> Pair:
-    """Return real and imaginary part of Σ_n i^n h_n / (n+2)!, h_n the complete homogeneous symmetric polynomials.
-
-    As the nodes have mean zero, h_n = p h_(n-2) + q h_(n-3), with p = Σ node²/2 and their product q.
-    """
-    lowest = (ab + ac) / -3
-    p = (ab * (ab - ac) + ac * ac) / 3
-    q = lowest * (ab + lowest) * (ac + lowest)
-    parts, (before, last, this), n = [0.5 - p / 24, np.zeros_like(p)], (np.ones_like(p), np.zeros_like(p), 1 * p), 3
-    # |h_n| <= 2 (widest · 2/3)^n: stop where a term is below half a rounding error of 1/2.
-    while 2 * (widest * 2 / 3) ** n / math.factorial(n + 2) > 2e-17:
-        before *= q
-        before += p * last
-        before, last, this, n = last, this, before, n + 1
-        parts[(n - 1) % 2] += (-1) ** ((n - 1) // 2) / math.factorial(n + 1) * this
-    return parts[0], parts[1]
-
-
-def _quotient(exponentials: Sequence[Array], ab: Array, ac: Array) -> Array:
+def _quotient(exponentials: Sequence[Array], ab: Array, bc: Array) -> Array:
     """Return the difference quotient of the two first differences that meet across the widest gap."""
     a, b, c = exponentials
-    bc = ac - ab
+    ac = ab + bc
     of_ab, of_ac, of_bc = _first_difference(a, b, ab), _first_difference(a, c, ac), _first_difference(b, c, bc)
     across_ab = np.abs(ab) >= np.maximum(np.abs(ac), np.abs(bc))
     across_ac = np.abs(ac) >= np.abs(bc)
