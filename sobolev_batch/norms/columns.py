@@ -84,7 +84,6 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
     "area": described("area", AREA),
     "family": described("family of the mesh"),
     "name": described("name of the mesh in its family"),
-    "study": described("study of the mesh, where several stores are open as one"),
     "is_reference": described("true for the reference, whose distance is zero"),
     "level": described("refinement level; -1 without levels", NUMBER),
     "rank": described("place in the family, from coarse to fine where it has such an order", NUMBER),

@@ -1,6 +1,5 @@
 """Fields in a store: their chunks, of blocks of the lattice and of octaves, written and read against checksums."""
 
-from bisect import bisect_right
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -61,29 +60,26 @@ class Fields:
         They are compared with the checksums that the tasks returned; without these, missing values read as NaN. A
         DamageError names the row whose values are damaged, lost, or others.
         """
-        parts = self.store.stores
-        arrays = [part.array(FIELD if len(place) == len(AXES) else OCTAVES) for _, part in parts]
-        values = np.empty((len(rows), *(axis.stop - axis.start for axis in place)), dtype=arrays[0].dtype)
+        store, array = self.store, self.store.array(FIELD if len(place) == len(AXES) else OCTAVES)
+        values = np.empty((len(rows), *(axis.stop - axis.start for axis in place)), dtype=array.dtype)
 
         def read(i: int) -> None:
-            number = bisect_right(parts, rows[i], key=lambda part: part[0]) - 1
-            first, store = parts[number]
             # On object storage, all but a wrong checksum is a failure of the access.
             damage = ValueError if store.location.scheme else (OSError, ValueError)
             with store.location.access("read"):
                 try:
                     # It is read in place: copying a field costs as much as reading it.
                     buffer = NDBuffer.from_numpy_array(values[i])
-                    arrays[number].get_basic_selection((rows[i] - first, *place), out=buffer)
+                    array.get_basic_selection((rows[i], *place), out=buffer)
                 except damage as error:
-                    raise _damage(store, rows[i] - first, str(error)) from error
+                    raise _damage(store, rows[i], str(error)) from error
             if checksums is not None and checksum_of(values[i]) != checksums[i]:
                 lost = bool(np.isnan(values[i]).all())
                 problem = "it is not there" if lost else "it is not what was written for its record"
-                raise _damage(store, rows[i] - first, problem)
+                raise _damage(store, rows[i], problem)
 
         # Most of the time of a request is spent waiting.
-        with ThreadPoolExecutor(max(1, len(rows)) if self.store.location.scheme else 1) as pool:
+        with ThreadPoolExecutor(max(1, len(rows)) if store.location.scheme else 1) as pool:
             list(pool.map(read, range(len(rows))))
         return values
 

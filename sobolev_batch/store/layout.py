@@ -18,7 +18,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from itertools import accumulate, zip_longest
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Self
 
@@ -205,11 +205,6 @@ class Store:
     def removed(self) -> frozenset[str]:
         """Labels of the meshes that the study has lost; their fields stay, in case they come back."""
         return frozenset(self.attributes().get(REMOVED, ()))
-
-    @property
-    def stores(self) -> tuple[tuple[int, Store], ...]:
-        """The stores that this one is made of, each with the number of rows before its own; see `JoinedStore`."""
-        return ((0, self),)
 
     @property
     def row_count(self) -> int:
@@ -421,25 +416,6 @@ class Store:
         expected = 0 if document["data_type"] == "string" else largest_chunk_bytes(document)
         stored = {index: sizes.get(key, 0) for key, index in self.chunk_keys(name).items()}
         return [index for index, size in stored.items() if not size or (expected and size != expected)]
-
-
-class JoinedStore(Store):
-    """Stores of one lattice and one reference, read as one: rows follow each other, metadata are the first one's."""
-
-    def __init__(self, stores: Sequence[Store], labels: Sequence[str]) -> None:
-        super().__init__(stores[0].location)
-        self.documents = stores[0].documents
-        self._stores, self._labels = tuple(stores), tuple(labels)
-
-    @property
-    def stores(self) -> tuple[tuple[int, Store], ...]:
-        """The stores, each with the number of rows before its own."""
-        firsts = accumulate((store.row_count for store in self._stores), initial=0)
-        return tuple(zip(firsts, self._stores, strict=False))
-
-    def labels(self) -> tuple[str, ...]:
-        """Return the label of each row; empty for rows that are left out."""
-        return self._labels
 
 
 def stored_choice(store: str | Path | Location) -> LatticeChoice | None:

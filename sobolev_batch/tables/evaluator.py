@@ -110,7 +110,7 @@ class Evaluator:
     ) -> Self:
         """Return the evaluator of rows with stored qualities; distances are to the reference, or another row."""
         qualities = {row: Quality.from_json(text) for row, text in stored.items()}
-        count = sum(part.row_count for _, part in store.stores)
+        count = store.row_count
         known = reference if reference in qualities else None
         extents = [quality.extent for quality in qualities.values()]
         evaluator = cls(

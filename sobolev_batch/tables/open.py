@@ -1,28 +1,22 @@
 """A store that is open for reading, and what it has: groups, orders, families and units."""
 
-import json
 import logging
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
-from itertools import accumulate, chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.fields import Quality
-from sobolev_batch.sources.names import quoted
 from sobolev_batch.store import layout
 from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import mapping_in
 from sobolev_batch.store.objects import stores_below
-from sobolev_batch.tables.all_objects import concatenated
 from sobolev_batch.visible import FILE_UNITS
 
 _log = logging.getLogger(__name__)
@@ -33,15 +27,13 @@ AnyStores = AnyStore | Mapping[str, AnyStore]
 
 # Entries of the encoding of a tree: where it was opened, and the digest of its tables then.
 _SOURCE, _STATE = "source", "state"
-# Another entry: the trees of several stores that are open as one, each with the new labels of its meshes by their own.
-_PARTS = "parts"
 # Groups that may be larger than the memory: xarray computes with them chunk by chunk.
 _LARGE = {"fourier", layout.OCTAVES_GROUP, layout.SPECTRA_GROUP}
 # What zarr and xarray raise for metadata that nobody has written.
 _MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
 
 
-def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -> xr.DataTree:
+def open_store(store: str | Path | Location) -> xr.DataTree:
     """Open a store lazily, as ``xarray.open_datatree(store, engine="zarr")`` does.
 
     Groups: fourier (the fields), spectra, meshes, norms, distances, convergence, records; where the study requests it
@@ -50,15 +42,11 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     the coordinate `object`. Fields and spectra are Dask arrays, unless the store is in memory; fields
     have the accessor `field.sobolev`.
 
-    Several stores open as one, without copies of their fields. They need the same lattice, similarity and reference.
-    Their meshes follow each other, with the name of their `study` as a coordinate, which begins labels and families if
-    a label comes twice. Tables have the orders that all stores have, and distances to the reference.
-
     Args:
-        store: Path or URL of the store, or several.
+        store: Path or URL of the store.
 
     Raises:
-        StoreError: The location has no store of a study, or cannot be reached; or several stores do not fit together.
+        StoreError: The location has no store of a study, or cannot be reached.
         DamageError: What is read at once is damaged. All else that is missing or damaged raises when it is read.
 
     >>> import sobolev_batch as sb
@@ -68,8 +56,6 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     >>> tree["convergence"].attrs["reference"]
     'reference'
     """
-    if isinstance(store, Iterable) and not isinstance(store, str):
-        return _joined([open_store(place) for place in store])
     # The process may go to another folder before it reads values; zarr would take those of a relative path for missing.
     location = Location.parse(store).absolute()
     opened = Store(location)
@@ -103,82 +89,9 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     return tree
 
 
-def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
-    if not trees:
-        raise InputError("no store is named")
-    first, *others = map(_common, trees)
-    for tree, common in zip(trees[1:], others, strict=True):
-        if differences := [name for name, value in common.items() if value != first[name]]:
-            raise StoreError(
-                f"{source_of(tree)}: it cannot be opened as one with {source_of(trees[0])}: "
-                f"they differ in {', '.join(differences)}"
-            )
-    names, study = _names_in_all(trees), root_attribute(trees[0], "study")
-    stored = [set(root_attribute(tree, "study")["orders"]) for tree in trees]
-    orders = [s for s in study["orders"] if all(s in others for others in stored)]
-    firsts = [*accumulate((store_of(tree).row_count for tree in trees), initial=0)]
-    groups = {
-        group: concatenated(
-            [_part(tree, group, own, first, orders) for tree, own, first in zip(trees, names, firsts, strict=False)]
-        )
-        for group in trees[0].children
-        if group != layout.RECORDS and all(group in tree.children for tree in trees)
-    }
-    groups["convergence"].attrs["reference"] = reference_of(trees[0])
-    title = " + ".join(str(tree.attrs["title"]) for tree in trees)
-    joined = xr.DataTree.from_dict(groups)
-    joined.attrs = {**trees[0].attrs, "title": title, "study": json.dumps({**study, "name": title, "orders": orders})}
-    joined.encoding = {_PARTS: list(zip(trees, names, strict=True))}
-    return joined
-
-
-def _common(tree: xr.DataTree) -> dict[str, Any]:
-    reference = finished_group(tree, "meshes", load=False)["key"].sel(mesh=reference_of(tree)).item()
-    of_study = {name: root_attribute(tree, "study")[name] for name in ("lattice", "dtype", "octaves")}
-    return {**of_study, "similarity": root_attribute(tree, "similarity"), "reference": reference}
-
-
-def _names_in_all(trees: Sequence[xr.DataTree]) -> list[dict[str, str]]:
-    """Return the label among all stores of each mesh by its own label; the reference is that of the first store."""
-    own = [finished_group(tree, "meshes", load=False)["mesh"].values.tolist() for tree in trees]
-    for tree, labels in zip(trees[1:], own[1:], strict=True):
-        labels.remove(reference_of(tree))
-    twice = next((label for label, count in Counter(chain(*own)).items() if count > 1), None)
-    begins = [f"{root_attribute(tree, 'study')['name']}/" if twice else "" for tree in trees]
-    if twice and len(set(begins)) < len(begins):
-        raise StoreError(f"{source_of(trees[0])}: another study of the same name has a mesh {quoted(twice)} too")
-    names = [{label: f"{begin}{label}" for label in labels} for begin, labels in zip(begins, own, strict=True)]
-    names[0][reference_of(trees[0])] = reference_of(trees[0])
-    return names
-
-
-def _part(tree: xr.DataTree, group: str, names: Mapping[str, str], first: int, orders: Sequence[float]) -> xr.Dataset:
-    """Return a group of one of several stores: of these meshes, with their labels among all, and rows after others."""
-    part, study = tree[group].to_dataset(), str(root_attribute(tree, "study")["name"])
-    if "order" in part.dims:
-        part = part.sel(order=list(orders))
-    if "other" in part.dims:
-        part = part.drop_dims(["tile", "other_tile"], errors="ignore").sel(other=[reference_of(tree)])
-    own = [label for label in part["mesh"].values.tolist() if label in names]
-    part = part.sel(mesh=own)
-    columns = {"mesh": [names[label] for label in own], "study": [study] * len(own)}
-    if "family" in part.coords:
-        begins = [names[label].removesuffix(label) for label in own]
-        columns["family"] = [f"{begin}{family}" for begin, family in zip(begins, part["family"].values, strict=True)]
-    if "row" in part:
-        part = part.assign(row=part["row"] + first)
-    dtype = part["mesh"].dtype
-    return part.assign_coords({name: ("mesh", np.array(texts, dtype)) for name, texts in columns.items()})
-
-
 def store_of(tree: xr.DataTree) -> Store:
-    """Return the store of an open tree, or those of several as one."""
-    if _PARTS not in tree.encoding:
-        return Store.open(location_of(tree))
-    stores = [Store.open(location_of(part)) for part, _ in tree.encoding[_PARTS]]
-    names = [own for _, own in tree.encoding[_PARTS]]
-    labels = [own.get(label, "") for store, own in zip(stores, names, strict=True) for label in store.labels()]
-    return layout.JoinedStore(stores, labels)
+    """Return the store of an open tree."""
+    return Store.open(location_of(tree))
 
 
 def as_tree(store: AnyStore) -> xr.DataTree:
@@ -205,32 +118,27 @@ def objects_of(store: AnyStores) -> tuple[str, ...]:
 
 
 def source_of(tree: xr.DataTree) -> str | None:
-    """Return the path or URL at which a tree was opened by `open_store`, or all of them; None for other trees."""
-    if _PARTS in tree.encoding:
-        return ", ".join(str(source_of(part)) for part, _ in tree.encoding[_PARTS])
+    """Return the path or URL at which a tree was opened by `open_store`; None for other trees."""
     source = tree.encoding.get(_SOURCE)
     return None if source is None else str(source)
 
 
 def require_unchanged(tree: xr.DataTree) -> None:
     """Check that all that was read of a store is one state of it; StoreError where a run has changed it since."""
-    for part, _ in tree.encoding.get(_PARTS, [(tree, {})]):
-        source = source_of(part)
-        # One that xarray itself has opened says so among its attributes.
-        state = part.encoding.get(_STATE, part.attrs.get(layout.DIGEST))
-        if source is not None and Store.open(source).attributes().get(layout.DIGEST) != state:
-            raise StoreError(
-                f"{source}: a run has changed the store while it was read; once that run has ended, open the store "
-                "again, or give the same command again"
-            )
+    source = source_of(tree)
+    # One that xarray itself has opened says so among its attributes.
+    state = tree.encoding.get(_STATE, tree.attrs.get(layout.DIGEST))
+    if source is not None and Store.open(source).attributes().get(layout.DIGEST) != state:
+        raise StoreError(
+            f"{source}: a run has changed the store while it was read; once that run has ended, open the store "
+            "again, or give the same command again"
+        )
 
 
 def location_of(store: AnyStore) -> str | Path | Location:
-    """Return the path or URL of a store; InputError for a DataTree of several stores, or from elsewhere."""
+    """Return the path or URL of a store; InputError for a DataTree from elsewhere."""
     if not isinstance(store, xr.DataTree):
         return store
-    if _PARTS in store.encoding:
-        raise InputError(f"{source_of(store)}: this is done for one store at a time")
     if (source := source_of(store)) is None:
         raise InputError(
             "the DataTree does not say where it was opened; open it with sobolev_batch.open_store, "

@@ -11,7 +11,7 @@ from sobolev_batch.norms.columns import describe
 from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import QUALITY
-from sobolev_batch.store.records import Record, Records
+from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import complete_records, rows_unlike_tables
 from sobolev_batch.tables.evaluator import Evaluator
 from sobolev_batch.tables.open import finished_group, reference_of, require_unchanged, source_of, store_of
@@ -32,17 +32,13 @@ def stored_evaluator(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Ev
     """
     store, orders = store_of(tree), check_orders(order)
     labels, removed, chosen = store.labels(), store.removed, set(meshes)
-    complete: dict[int, Record] = {}
-    for first, part in store.stores:
-        own = labels[first : first + part.row_count]
-        known = ((i, label) for i, label in enumerate(own) if label and label not in removed)
-        wanted = {i for i, label in known if not chosen or label in chosen}
-        read = {i: Records(part).read_one(i) for i in wanted} if meshes else dict(enumerate(Records(part).read()))
-        records = [read[i] if i in wanted else None for i in range(len(own))]
-        for i, problem in (rows_unlike_tables(part, records) if wanted else {}).items():
-            if i in wanted:
-                raise part.damage(f"the field of {own[i]}", problem, i)
-        complete |= {first + row: record for row, record in complete_records(records).items()}
+    wanted = {i for i, label in enumerate(labels) if label not in removed and (not chosen or label in chosen)}
+    read = {i: Records(store).read_one(i) for i in wanted} if meshes else dict(enumerate(Records(store).read()))
+    records = [read[i] if i in wanted else None for i in range(len(labels))]
+    for i, problem in (rows_unlike_tables(store, records) if wanted else {}).items():
+        if i in wanted:
+            raise store.damage(f"the field of {labels[i]}", problem, i)
+    complete = complete_records(records)
     places = {label: row for row, label in enumerate(labels)}
     for mesh in meshes:
         if places.get(mesh) not in complete:
@@ -66,14 +62,12 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     labels, complete_rows, own_keys = (complete[name].values.tolist() for name in ("mesh", "row", "key"))
     row_of_reference = dict(zip(labels, complete_rows, strict=True)).get(reference, -1)
     keys = spectrum_keys(dict(zip(complete_rows, own_keys, strict=True)), row_of_reference)
-    qualities: dict[int, str] = {}
-    for first, part in store.stores:
-        rows = [row for row in sorted(keys) if first <= row < first + part.row_count]
-        if stale_chunks(part, {row - first: keys[row] for row in rows}):
-            problem = "they are not those of the stored fields"
-            raise DamageError(f"{part.path}: radial spectra are damaged ({problem}); run the study again", problem)
-        texts = np.asarray(part.read(QUALITY, [row - first for row in rows])).tolist() if rows else []
-        qualities |= zip(rows, texts, strict=True)
+    if stale_chunks(store, keys):
+        problem = "they are not those of the stored fields"
+        raise DamageError(f"{store.path}: radial spectra are damaged ({problem}); run the study again", problem)
+    rows = sorted(keys)
+    texts = np.asarray(store.read(QUALITY, rows)).tolist() if rows else []
+    qualities = dict(zip(rows, texts, strict=True))
     evaluator = Evaluator.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
     return Results.from_spectra(evaluator, table, reference)
 

@@ -27,11 +27,10 @@ def spectrum_keys(keys: Mapping[int, str], reference: int) -> dict[int, str]:
 
 def chunks_of_spectra(store: Store) -> Iterator[range]:
     """Yield the rows of each chunk of spectra."""
-    for before, part in store.stores:
-        document = part.document(SPECTRA_KEYS)
-        (count,), (step,) = document["shape"], chunk_shape(document)
-        for first in range(0, count, step):
-            yield range(before + first, before + min(first + step, count))
+    document = store.document(SPECTRA_KEYS)
+    (count,), (step,) = document["shape"], chunk_shape(document)
+    for first in range(0, count, step):
+        yield range(first, min(first + step, count))
 
 
 def stale_chunks(store: Store, keys: Mapping[int, str]) -> dict[int, range]:
@@ -86,13 +85,11 @@ def _places(of: set[int], rows: range) -> list[int]:
 def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
     """Return the spectra of rows, in their order; a damaged chunk raises a `DamageError`."""
     parts, wanted = [], set(rows)
-    for before, part in store.stores:
-        for number, chunk in enumerate(chunks_of_spectra(part)):
-            of_chunk = {row - before for row in wanted.intersection(range(before + chunk.start, before + chunk.stop))}
-            if of_chunk:
-                _, arrays = read_chunk(part, SPECTRA_KEYS, (number,))
-                chosen = {name.partition("/")[2]: values[_places(of_chunk, chunk)] for name, values in arrays.items()}
-                parts.append(ComparedSpectra(chosen))
+    for number, chunk in enumerate(chunks_of_spectra(store)):
+        if of_chunk := wanted.intersection(chunk):
+            _, arrays = read_chunk(store, SPECTRA_KEYS, (number,))
+            chosen = {name.partition("/")[2]: values[_places(of_chunk, chunk)] for name, values in arrays.items()}
+            parts.append(ComparedSpectra(chosen))
     places = {row: place for place, row in enumerate(sorted(wanted))}
     return ComparedSpectra.joined(parts)[[places[row] for row in rows]]
 
