@@ -28,8 +28,6 @@ PARTS_OF_SCIPY = {"fft", "fftpack", "linalg", "sparse", "special", "version"}
         ("import sobolev_batch", LIBRARIES),
         # Help texts appear before anything computes.
         ("import sobolev_batch.cli", LIBRARIES),
-        # All tests of a project that asks for it wait for it.
-        ("import sobolev_batch.testing.pytest_plugin", LIBRARIES | {"click"}),
         (FIRST_FIELD, HEAVY),
     ],
 )
