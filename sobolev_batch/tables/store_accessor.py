@@ -4,25 +4,19 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.errors import InputError
-from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.causes import band_coordinates
 from sobolev_batch.norms.columns import AREA, KERNEL, LENGTH, NUMBER, described, order_axis
-from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
+from sobolev_batch.norms.estimate import AREA_AND_SHAPE
 from sobolev_batch.parameters import as_names
 from sobolev_batch.tables.evaluator import Evaluator
 from sobolev_batch.tables.open import complete_meshes, finished_group, reference_of, similarity_of
 from sobolev_batch.tables.other_orders import Meshes, convergence_at, norms_at, require_fields, stored_evaluator
-from sobolev_batch.tables.pairs import pair_distances
 from sobolev_batch.tables.results import table_of
-from sobolev_batch.tables.stored_spectra import lower_bounds
-from sobolev_batch.transform.lattice import Orders, check_orders, single_order, smooth_step
+from sobolev_batch.transform.lattice import Orders, check_orders, smooth_step
 
 # The upper end of a band, its squares (orders,), its energy, and the standard error of that.
 Band = tuple[float, Reals, float, float]
 _OF_DISTANCES = ("distance", "error", "error_part", "relative", "relative_error", *AREA_AND_SHAPE)
-# Meshes whose distances from another are computed at a time, until others are certainly farther.
-_CANDIDATES = 32
 # The innermost octave has this many spacings of the lattice within it.
 _FEWEST_SPACINGS = 4
 # A band's window is one half at this fraction of its cutoff.
@@ -106,51 +100,6 @@ class StoreAccessor:
         columns["relative"], columns["relative_error"] = found.distances.relative_to(found.reference.norms)
         table = table_of(columns, meshes.sel(mesh=labels), evaluator.orders)
         return self._chosen(table, order, mesh if isinstance(mesh, str) else labels)
-
-    def nearest(self, mesh: str, count: int = 10, order: float = DEFAULT_ORDER) -> xr.Dataset:
-        """Return the meshes with the smallest distances from one, the smallest first.
-
-        Spectra bound each distance from below, so that only the fields of near meshes are read. Where errors overlap,
-        another mesh may truly be nearer, also one that is left out.
-
-        Args:
-            mesh: Label of a mesh.
-            count: Number of meshes; fewer where the store has fewer others.
-            order: Order s < -1/2.
-
-        Returns:
-            Dataset over `mesh` with `distance`, its `error`, and as `error_part` the parts of that (`part`).
-
-        Raises:
-            InputError: The count is not positive; see `StoreAccessor` for others.
-
-        >>> import sobolev_batch as sb
-        >>> tree = sb.open_store("storage/icosphere.zarr")
-        >>> tree.sobolev.nearest("icosphere/1", 2, order=-4)["mesh"].values.tolist()
-        ['icosphere/2', 'icosphere/3']
-        """
-        if count < 1:
-            raise InputError(f"the number of nearest meshes must be positive, found {count!r}")
-        orders, meshes = (single_order(order),), finished_group(self._tree, "meshes")
-        evaluator, _ = stored_evaluator(self._tree, orders)
-        labels = dict(zip(meshes["row"].values.tolist(), meshes["mesh"].values.tolist(), strict=True))
-        require_fields(self._tree, meshes, [mesh])
-        row = int(meshes["row"].sel(mesh=mesh).item())
-        bounds = lower_bounds(evaluator, row, {one for one in evaluator.complete if one in labels and one != row})
-        candidates = sorted(bounds, key=bounds.__getitem__)
-        # Values and the parts of their errors, and their rows, nearest first.
-        found, rows = np.empty((5, 0)), np.empty(0, dtype=np.int64)
-        for start in range(0, len(candidates), _CANDIDATES):
-            if len(rows) >= count and found[0, -1] <= bounds[candidates[start]]:
-                break
-            group = candidates[start : start + _CANDIDATES]
-            found = np.hstack([found, pair_distances(evaluator, [row], group).stacked[:, 0, 0]])
-            rows = np.append(rows, group)
-            nearest = np.lexsort((rows, found[0]))[:count]
-            found, rows = found[:, nearest], rows[nearest]
-        estimate = NormEstimate(*found[:, None])
-        table = table_of(estimate.named("distance"), meshes.sel(mesh=[labels[one] for one in rows.tolist()]), orders)
-        return table.sel(order=orders[0])
 
     def _chosen(self, table: xr.Dataset, order: Orders, mesh: Meshes) -> xr.Dataset:
         """Return a table (mesh, order) of some meshes, without the dimension of what is single."""

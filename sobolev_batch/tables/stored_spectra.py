@@ -1,11 +1,10 @@
 """Radial spectra in the store: computed from fields by tasks, one chunk of rows each, and read for any order."""
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
 
-from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.spectrum import ComparedSpectra
 from sobolev_batch.store.layout import SPECTRA_GROUP, SPECTRA_KEYS, Store
@@ -15,8 +14,6 @@ from sobolev_batch.tables.evaluator import Evaluator
 
 # Raise it whenever the same fields lead to other spectra: those of older versions are then made again.
 _SPECTRA_VERSION = 3
-# Rounding may raise a lower bound by this fraction of it.
-_ROUNDING = 1e-9
 
 
 def spectrum_keys(keys: Mapping[int, str], reference: int) -> dict[int, str]:
@@ -92,22 +89,3 @@ def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
             parts.append(ComparedSpectra(chosen))
     places = {row: place for place, row in enumerate(sorted(wanted))}
     return ComparedSpectra.joined(parts)[[places[row] for row in rows]]
-
-
-def lower_bounds(evaluator: Evaluator, row: int, others: Set[int]) -> dict[int, float]:
-    """Return a lower bound on the distance of a row from each of some others, at the evaluator's first order.
-
-    On each shell two fields differ by no less than their norms there, or those of their differences from a third field.
-    """
-
-    def shells(rows: Sequence[int]) -> Reals:
-        spectra = read_spectra(evaluator.store, rows)
-        chosen = spectra.norm if evaluator.reference is None else spectra.distance
-        return np.asarray(np.sqrt(np.maximum(chosen.sums[:, : evaluator.lattice.shell_count], 0.0)))
-
-    own, weights, bounds = shells([row]), evaluator.weights.per_shell[0], dict[int, float]()
-    for chunk in chunks_of_spectra(evaluator.store):
-        if rows := [one for one in chunk if one in others]:
-            squares = (shells(rows) - own) ** 2 @ weights
-            bounds |= zip(rows, ((1 - _ROUNDING) * np.sqrt(squares)).tolist(), strict=True)
-    return bounds

@@ -21,10 +21,8 @@ import xarray as xr
 import sobolev_batch as sb
 from sobolev_batch.errors import StoreError
 from sobolev_batch.norms.fields import Quality
-from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Records
-from sobolev_batch.tables import store_accessor
 from sobolev_batch.tables.accessor import SobolevAccessor
 from sobolev_batch.transform.spheres import sphere_inner_product
 from tests.support.studies import small_table, variable
@@ -230,23 +228,3 @@ def test_errors_of_area_and_shape_cover_the_closed_form(balls: str) -> None:
     equal = found.sel(mesh="b2/sphere")
     assert (equal["area_part_error"] == 0).all()
     assert (equal["shape_part_error"] == 0).all()
-
-
-@pytest.mark.parametrize(("mesh", "order"), [("b5/sphere", -3.0), ("b5/sphere", -1.2), ("reference", -3.0)])
-def test_the_nearest_meshes_are_found_without_the_fields_of_others(
-    balls: str, mesh: str, order: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read: set[int] = set()
-    read_fields = Fields.read
-
-    def recording(fields: Fields, rows: list[int], *arguments: Any) -> Any:
-        read.update(rows)
-        return read_fields(fields, rows, *arguments)
-
-    monkeypatch.setattr(store_accessor, "_CANDIDATES", 2)
-    expected = sb.matrix(balls, order)[mesh].drop([mesh, "lost/nowhere"]).nsmallest(3)
-    monkeypatch.setattr(Fields, "read", recording)
-    found = sb.open_store(balls).sobolev.nearest(mesh, 3, order)
-    pd.testing.assert_series_equal(found["distance"].to_series(), expected, rtol=1e-9, check_names=False)
-    assert len(read) <= 8
-    assert sb.open_store(balls).sobolev.nearest("b5/sphere", 50).sizes["mesh"] == 12
