@@ -45,8 +45,8 @@ REFUSED: dict[str, tuple[Any, ...]] = {
     **dict.fromkeys(("store", "new", "old", "path", "output"), (3, "\0")),
     **dict.fromkeys(("x", "y"), (3, {3}, "order", "rate", "within", ())),
 }
-# Those of derivatives need libraries that may be missing, and one judges sources of other packages.
-EXEMPT = {"fitting.jax_function", "fitting.torch_function", "sources.check_source"}
+# It judges sources of other packages.
+EXEMPT = {"sources.check_source"}
 _OF_DISTANCES = {"order": -4.0, "best_effort": False, "seed": 0, "on_progress": None}
 _ON_LATTICE = {**_OF_DISTANCES, "lattice": LATTICE, "rtol": None}
 _OF_FITS = {

@@ -2,8 +2,6 @@
 from .align import align as align
 from .derivatives import SquaredDistance as SquaredDistance
 from .derivatives import gradient as gradient
-from .derivatives import jax_function as jax_function
-from .derivatives import torch_function as torch_function
 from .fit import Fit as Fit
 from .fit import FitProgress as FitProgress
 from .fit import FitQuality as FitQuality

@@ -1,17 +1,17 @@
-"""Squared distances as functions of the vertices of a mesh, also of tensors: value, derivative, error of that."""
+"""Squared distances as functions of the vertices of a mesh: value, derivative, and the error of that."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
 from sobolev_batch.arrays import Complexes, Reals
-from sobolev_batch.errors import InputError, from_extra
+from sobolev_batch.errors import InputError
 from sobolev_batch.extras.fitting.adjoint import MeshTransform, field_values
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.mesh import Mesh
@@ -126,88 +126,6 @@ def squares_of(values: Complexes, factors: Iterable[Reals]) -> Reals:
     """Return the squared norms of values on the half lattice, one for the weights of samples of each order."""
     energies = squared_moduli(values)
     return np.array([np.sum(one * energies) for one in factors])
-
-
-def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
-    """Return a squared distance as a differentiable function of a PyTorch tensor.
-
-    Returns:
-        Function of a tensor of vertices, (n, 3) or (3n,), that returns a scalar tensor of the same dtype and device. It
-        computes in double precision on the processor; a double tensor there is read without a copy. It can be
-        differentiated once. Errors are those of `SquaredDistance`.
-
-    Raises:
-        InputError: PyTorch is not installed.
-
-    >>> import sobolev_batch as sb
-    >>> ball = sb.shapes.icosphere(1)
-    >>> squared = sb.fitting.SquaredDistance.for_mesh(ball, sb.shapes.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
-    >>> function = sb.fitting.torch_function(squared)  # doctest: +SKIP
-    >>> function(torch.tensor(ball.vertices, requires_grad=True)).backward()  # doctest: +SKIP
-    """
-    with from_extra("torch", "functions of PyTorch need"):
-        import torch
-        from torch.autograd.function import once_differentiable
-
-    class _Function(torch.autograd.Function):  # type: ignore[misc]
-        @staticmethod
-        def forward(context: Any, vertices: Any) -> Any:
-            positions = vertices.detach().cpu().numpy()
-            if not context.needs_input_grad[0]:
-                return vertices.new_tensor(squared.value(positions))
-            value, gradient = squared(positions)
-            context.save_for_backward(torch.from_numpy(gradient).to(vertices))
-            return vertices.new_tensor(value)
-
-        @staticmethod
-        @once_differentiable
-        def backward(context: Any, slope: Any) -> Any:
-            (gradient,) = context.saved_tensors
-            return slope * gradient
-
-    return _Function.apply  # type: ignore[no-any-return]
-
-
-def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
-    """Return a squared distance as a differentiable function of a JAX array.
-
-    Returns:
-        Function of an array of vertices, (n, 3) or (3n,), that returns a scalar of the same dtype. It works under
-        `jax.jit` and `jax.grad`, and computes in double precision on the host. It can be differentiated once, in
-        reverse mode. JAX passes errors of `SquaredDistance` on as its own.
-
-    Raises:
-        InputError: JAX is not installed.
-
-    >>> import sobolev_batch as sb
-    >>> ball = sb.shapes.icosphere(1)
-    >>> squared = sb.fitting.SquaredDistance.for_mesh(ball, sb.shapes.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
-    >>> function = sb.fitting.jax_function(squared)  # doctest: +SKIP
-    >>> gradient = jax.grad(function)(jax.numpy.asarray(ball.vertices))  # doctest: +SKIP
-    """
-    with from_extra("jax", "functions of JAX need"):
-        import jax
-
-    def value(vertices: Any) -> Any:
-        return np.asarray(squared.value(np.asarray(vertices)), dtype=vertices.dtype)
-
-    def value_and_gradient(vertices: Any) -> tuple[Any, Any]:
-        found, gradient = squared(np.asarray(vertices))
-        return np.asarray(found, dtype=vertices.dtype), gradient.astype(vertices.dtype)
-
-    def forward(vertices: Any) -> Any:
-        shapes = jax.ShapeDtypeStruct((), vertices.dtype), jax.ShapeDtypeStruct(vertices.shape, vertices.dtype)
-        return jax.pure_callback(value_and_gradient, shapes, vertices)
-
-    def backward(gradient: Any, slope: Any) -> tuple[Any]:
-        return (slope * gradient,)
-
-    @jax.custom_vjp
-    def function(vertices: Any) -> Any:
-        return jax.pure_callback(value, jax.ShapeDtypeStruct((), vertices.dtype), vertices)
-
-    function.defvjp(forward, backward)
-    return function  # type: ignore[no-any-return]
 
 
 def gradient(

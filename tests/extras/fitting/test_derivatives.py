@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Sequence
 from functools import cache
 from itertools import product
@@ -245,47 +244,3 @@ def test_positions_are_checked() -> None:
         sb.fitting.gradient(sb.shapes.icosphere(0), SPHERE, -2.0)
     with pytest.raises(sb.errors.InputError, match="one order is needed, found 2"):
         sb.fitting.SquaredDistance.for_mesh(sb.shapes.icosphere(0), SPHERE, [-2.0, -3.0], lattice=SMALL)  # type: ignore[arg-type]
-
-
-@pytest.fixture(scope="module")
-def squared() -> sb.fitting.SquaredDistance:
-    return sb.fitting.SquaredDistance.for_mesh(BALL, sb.shapes.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
-
-
-@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-12), ("float32", 1e-4)])
-def test_torch_gives_the_same(squared: sb.fitting.SquaredDistance, dtype: str, tolerance: float) -> None:
-    torch = pytest.importorskip("torch", reason="PyTorch comes with the extra 'torch'")
-    value, gradient = squared(BALL.vertices)
-    vertices = torch.tensor(np.array(BALL.vertices), dtype=getattr(torch, dtype), requires_grad=True)
-    function = sb.fitting.torch_function(squared)
-    found = function(vertices)
-    (3 * found).backward()
-    assert found.dtype == vertices.grad.dtype == vertices.dtype
-    assert found.item() == pytest.approx(value, rel=tolerance)
-    assert function(vertices.detach()).item() == pytest.approx(value, rel=tolerance)
-    np.testing.assert_allclose(vertices.grad.numpy(), 3 * gradient, rtol=0, atol=tolerance * np.abs(gradient).max())
-    with pytest.raises(sb.errors.InputError, match="the mesh has 42 vertices"):
-        function(torch.zeros(5, 3))
-
-
-@pytest.mark.parametrize("compiled", [False, True])
-def test_jax_gives_the_same(squared: sb.fitting.SquaredDistance, compiled: bool) -> None:
-    jax = pytest.importorskip("jax", reason="JAX comes with the extra 'jax'")
-    value, gradient = squared(BALL.vertices)
-    vertices = jax.numpy.asarray(np.array(BALL.vertices))
-    function: Any = jax.value_and_grad(lambda moved: 3 * sb.fitting.jax_function(squared)(moved))
-    found, slopes = (jax.jit(function) if compiled else function)(vertices)
-    assert float(found) == pytest.approx(3 * value, rel=1e-4)
-    assert float(sb.fitting.jax_function(squared)(vertices)) == pytest.approx(value, rel=1e-4)
-    np.testing.assert_allclose(np.asarray(slopes), 3 * gradient, rtol=0, atol=1e-4 * np.abs(gradient).max())
-
-
-@pytest.mark.parametrize(("library", "name"), [("torch", "PyTorch"), ("jax", "JAX")])
-def test_a_missing_library_is_named(
-    squared: sb.fitting.SquaredDistance, library: str, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(
-        sb.errors.InputError, match=rf"{name} .* is missing .* pip install 'sobolev-batch\[{library}\]'"
-    ):
-        getattr(sb.fitting, f"{library}_function")(squared)
