@@ -156,7 +156,7 @@ def test_tables_in_every_format_at_lists_of_orders(folder: Path) -> None:
     assert rf"{number} \% ±" in frames["latex"]
     matrix = output("table", "matrix", STORE, "--format", "csv", folder=folder)
     assert len(matrix.splitlines()) == 1 + 2 * 3 * 3
-    options = ("--format", "json", "--below", "99%", "--order", "-3")
+    options = ("--format", "json", "--within", "99%", "--order", "-3")
     (row,) = json.loads(output("table", "smallest", STORE, *options, folder=folder))
     assert row["mesh"] == "ico/0"
 
@@ -255,12 +255,12 @@ def test_the_exit_status_of_a_verdict(folder: Path) -> None:
     pair = similarity.apply(first), similarity.apply(third)
     truth = sb.distance(*pair, -4, rtol=1e-4)["relative"].item()
     for file, below, status, word in (
-        ("3.off", "1e-6", 0, "same"),
+        ("3.off", "1e-4%", 0, "same"),
         ("1.off", "20%", 0, "same"),
-        ("1.off", "0.01", 1, "different"),
-        ("1.off", repr(truth), 4, "undecided"),
+        ("1.off", "1 %", 1, "different"),
+        ("1.off", f"{100 * truth!r}%", 4, "undecided"),
     ):
-        done = call("compare", file, "3.off", "--below", below, "--order", "-4", folder=folder)
+        done = call("compare", file, "3.off", "--within", below, "--order", "-4", folder=folder)
         assert (done.returncode, done.stderr) == (status, "")
         assert done.stdout.startswith(f"{file}: {word}")
         assert done.stdout.count("\n") == 1
@@ -339,7 +339,7 @@ def test_json_has_the_numbers_that_texts_round(folder: Path) -> None:
     assert found["proximity"]["hausdorff"] == sb.proximity(first, third)["hausdorff"]
     assert found["deviation"]["backward"]["upper"] == found["proximity"]["hausdorff_upper_backward"]
     assert len(found["deviation"]["forward"]["place"]) == 3
-    verdict = document("compare", "1.off", "3.off", "--below", "0.01", folder=folder, status=1)
+    verdict = document("compare", "1.off", "3.off", "--within", "1%", folder=folder, status=1)
     assert verdict["outcome"] == "different"
     assert 0.01 < verdict["lower"] < verdict["distance"] < verdict["upper"]
 
@@ -433,7 +433,7 @@ def test_an_error_is_no_difference(folder: Path, monkeypatch: pytest.MonkeyPatch
         raise RuntimeError("broken")
 
     monkeypatch.setattr("sobolev_batch.cli.comparison.same_surface", fail)
-    for options in (("--below", "0.1"), ("--below=0.1",)):
+    for options in (("--within", "10%"), ("--within=10%",)):
         done = call("compare", "1.off", "3.off", *options, folder=folder)
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr == "error: RuntimeError: broken (--debug shows where)\n"
@@ -474,9 +474,9 @@ MISUSED = [
     (f"table smallest {STORE}", "Missing option '--below'"),
     (f"export {STORE} -o t.nc --format netcdf --order -3", "netcdf has the orders of the study"),
     ("compare 1.off 3.off --rtol 1e-3 --M 64", "--rtol chooses the lattice"),
-    ("compare 1.off 3.off --below 0.1 --proximity --rtol 0.1", "leave out --proximity, --rtol"),
-    ("compare 1.off 3.off --below 0.1 --order -2,-4", "--below takes one --order"),
-    ("compare 1.off 3.off --below 0.1 --within 1", "leave out one of them"),
+    ("compare 1.off 3.off --within 10% --proximity --rtol 0.1", "leave out --proximity, --rtol"),
+    ("compare 1.off 3.off --within 10% --order -2,-4", "--within takes one --order"),
+    ("compare 1.off 3.off --within 100%", "less than 100 %, found 100%"),
     ("compare 1.off 3.off --threshold 1", "--threshold goes with --proximity or --report"),
     ("compare 1.off 3.off --within 1 --order -2 --proximity", "leave out --order, --proximity"),
     ("compare 1.off 3.off --within 1% --unit mm", "leave out --unit"),

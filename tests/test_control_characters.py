@@ -154,7 +154,7 @@ def test_commands_show_names_of_files(folder: Path) -> None:
         ("table", HOSTILE, f"--{HOSTILE}"),
         ("unlock", f"{HOSTILE}.zarr"),
         ("compare", f"{HOSTILE}/good.obj", f"{HOSTILE}/broken.obj"),
-        ("compare", f"{HOSTILE}.obj", f"{HOSTILE}/good.obj", "--below", "90%"),
+        ("compare", f"{HOSTILE}.obj", f"{HOSTILE}/good.obj", "--within", "90%"),
         ("fit", f"{HOSTILE}/good.obj", f"{HOSTILE}/good.obj", "-o", f"{HOSTILE}/none/a.obj"),
         ("run", f"{HOSTILE}.toml"),
     ):

@@ -40,7 +40,7 @@ from sobolev_batch.visible import FILE_UNITS, visible
 
 # Options that every verdict knows; those of one on a fraction of the norm, which chooses the accuracy of the distance
 # itself; and those of one on a length.
-_KNOWN = {"a", "b", "align", "below", "within", "report", "style"}
+_KNOWN = {"a", "b", "align", "within", "report", "style"}
 _KNOWN_OF_FRACTIONS, _KNOWN_OF_LENGTHS = {"orders", "memory", "no_scaling"}, {"unit", "one_way"}
 
 # A radius beyond it, or below its inverse, is far from the unit of length.
@@ -89,14 +89,13 @@ class CompareOptions:
     witness: Path | None
     report: Path | None
     no_scaling: bool
-    below: float | None
     within: str | None
     one_way: bool
     verbose: bool
     style: str
 
     def __post_init__(self) -> None:
-        if self.below is not None or self.within is not None:
+        if self.within is not None:
             self._check_verdict()
         elif self.one_way:
             raise click.UsageError("--one-way goes with --within LENGTH; give that, or leave it out")
@@ -108,9 +107,7 @@ class CompareOptions:
             require_writable(self.report, "the report")
 
     def _check_verdict(self) -> None:
-        if self.below is not None and self.within is not None:
-            raise click.UsageError("--below and --within ask for one verdict each; leave out one of them")
-        option, allowed = "--within" if self.below is None else "--below", self.allowed_fraction
+        allowed = self.allowed_fraction
         known = _KNOWN | (_KNOWN_OF_LENGTHS if allowed is None else _KNOWN_OF_FRACTIONS)
         context = click.get_current_context()
         given = [
@@ -119,23 +116,22 @@ class CompareOptions:
             if parameter.name not in known and getattr(self, str(parameter.name)) not in (None, False)
         ]
         if given:
-            asked = f"{option} with a length" if allowed is None else option
-            raise click.UsageError(f"{asked} gives a verdict and no numbers; leave out {', '.join(sorted(given))}")
-        if allowed is not None and not 0 < allowed < 1:
-            raise click.UsageError(f"{option} takes a fraction between 0 and 1, or 0 and 100 %, found {allowed:g}")
+            asked = "a length" if allowed is None else "a percentage"
+            left_out = ", ".join(sorted(given))
+            raise click.UsageError(f"--within with {asked} gives a verdict and no numbers; leave out {left_out}")
+        if allowed is not None and allowed >= 1:
+            raise click.UsageError(f"--within takes a length, or less than 100 %, found {self.within}")
         if len(self.chosen_orders) > 1:
-            raise click.UsageError(f"{option} takes one --order")
+            raise click.UsageError("--within takes one --order")
 
     @property
     def allowed_fraction(self) -> float | None:
         """The fraction of the norm of B that the distance may have for a verdict; None for one on a length, or none."""
-        if self.within is None:
-            return self.below
-        return fraction(self.within) if self.within.rstrip().endswith("%") else None
+        return fraction(self.within) if self.within is not None and self.within.rstrip().endswith("%") else None
 
     def verdict(self) -> tuple[str, dict[str, Any]] | None:
         """The line and the numbers of the verdict that is asked for; None without one."""
-        if self.allowed_fraction is None and self.within is None:
+        if self.within is None:
             return None
         numbers: dict[str, Any] = {"a": self.a, "b": self.b}
         a, b = self.meshes
@@ -146,7 +142,7 @@ class CompareOptions:
             (order,), scaling = self.chosen_orders, not self.no_scaling
             same = same_surface(a, b, tolerance=tolerance, order=order, scaling=scaling, memory=self.memory)
             return f"{self.names[0]}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
-        near = judge_deviation(a, b, str(self.within), self.unit, one_way=self.one_way, names=self.names)
+        near = judge_deviation(a, b, self.within, self.unit, one_way=self.one_way, names=self.names)
         numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "doubt": near.doubt}
         numbers |= {"beyond": near.beyond, "beyond_of": "ab"[near.beyond_of] if near.outcome == "not within" else None}
         return f"{self.names[0]}: {near}", numbers | asdict(near.largest) | asdict(near.deviations)

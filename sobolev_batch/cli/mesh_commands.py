@@ -13,7 +13,6 @@ import click
 
 from sobolev_batch.cli.options import (
     PATH,
-    below_option,
     client_of,
     format_option,
     json_option,
@@ -95,14 +94,13 @@ _STATUSES = {"same": 0, "within": 0, "different": 1, "not within": 1, "undecided
     "--report", type=PATH, metavar="PATH", help="Write one HTML page for a browser and for one sheet of paper."
 )
 @click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise B is scaled to the unit sphere.")
-@below_option("Tell whether the distance is below FRACTION of the norm of B, such as 1e-3 or 0.1%, by the exit status.")
 @click.option(
     "--within",
-    metavar="LENGTH",
-    help="Tell by the exit status whether no point of either mesh is farther from the other one than LENGTH, such as "
-    "0.1 in the files' unit, or 0.1mm with --unit. A percentage means --below.",
+    metavar="TOLERANCE",
+    help="Tell by the exit status whether no point of either mesh is farther from the other one than a length, such as "
+    "0.1 in the files' unit, or 0.1mm with --unit; or whether the distance is below 1% of the norm of B.",
 )
-@click.option("--one-way", is_flag=True, help="Of --within, count points of A alone: B may have parts that A lacks.")
+@click.option("--one-way", is_flag=True, help="Of a length, count points of A alone: B may have parts that A lacks.")
 @click.option("--verbose", is_flag=True, help="Also print the parts of each error, and the settings that were chosen.")
 @json_option
 @click.pass_context
@@ -112,11 +110,11 @@ def compare_command(context: click.Context, /, **options: Any) -> None:
     B is the reference. The difference is given in per cent of its norm, with an estimate of the largest error, the
     share of the squared distance that a change of area explains, and the move of B that takes it as far from itself.
 
-    Two options print one line instead: --below on whether both are the same surface, and --within on whether they are
-    as near everywhere as a length. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be
-    told, and 2 after any error.
+    With --within, one line says instead whether they are as near everywhere as a length, or the same surface to a
+    percentage. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be told, and 2 after any
+    error.
     """
-    if options["below"] is not None or options["within"] is not None:
+    if options["within"] is not None:
         # The usual status of other errors says that the files differ.
         context.meta[ERROR_STATUS] = EXIT_INPUT
     # Here, since it loads what computes.

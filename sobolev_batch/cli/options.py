@@ -70,17 +70,6 @@ json_option = _in_format(
 )
 
 
-def below_option(text: str, *, required: bool = False) -> Callable[[Callback], Callback]:
-    """Return the option --below of a command: a fraction of the norm of the reference, such as 0.01 or 1%."""
-
-    def fraction_of_norm(value: str) -> float:
-        from sobolev_batch.parameters import fraction
-
-        return fraction(value)
-
-    return click.option("--below", type=fraction_of_norm, metavar="FRACTION", required=required, help=text)
-
-
 def output_option(text: str, **settings: Any) -> Callable[[Callback], Callback]:
     """Return the option --output of a command that writes files."""
     return click.option("-o", "--output", **{"type": PATH, "show_default": True, **settings}, help=text)

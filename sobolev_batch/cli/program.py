@@ -126,8 +126,8 @@ def cli(context: click.Context, debug: bool) -> None:
     mesh and prints which are nearest to the reference.
 
     The exit status is 0 if all is done, 2 if the input is wrong, 3 if some meshes failed or are missing, 5 if a disk
-    is full, 1 after another error or a check that failed, 130 after Ctrl-C and 143 after SIGTERM. `compare --below`
-    and `compare --within` have their own.
+    is full, 1 after another error or a check that failed, 130 after Ctrl-C and 143 after SIGTERM. `compare
+    --within` has its own.
     """
     _set_up_logging(debug)
     command = cli.get_command(context, str(context.invoked_subcommand))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.cli.options import Callback, ChosenOrders, below_option, format_option, orders_option, store_argument
+from sobolev_batch.cli.options import Callback, ChosenOrders, format_option, orders_option, store_argument
 from sobolev_batch.cli.output import echo_lines
 from sobolev_batch.cli.program import NamedCommands, cli
 
@@ -91,8 +91,13 @@ def objects_command(store: Location, style: Format, orders: ChosenOrders) -> Non
 
 @table_command.command("smallest")
 @table_options
-@below_option("Take what is below FRACTION, such as 1%, of the norm of the reference.", required=True)
-def smallest_command(store: Location, style: Format, orders: ChosenOrders, below: float) -> None:
+@click.option(
+    "--below",
+    metavar="FRACTION",
+    required=True,
+    help="Take what is below this fraction of the norm of the reference, such as 0.01 or 1%.",
+)
+def smallest_command(store: Location, style: Format, orders: ChosenOrders, below: str) -> None:
     """Print the smallest mesh below a bound.
 
     For a bound on lengths, such as 0.1 mm, see `sobolev-batch reduce --within`.

@@ -79,7 +79,7 @@ def test_compare_aligns_first(folder: Path) -> None:
     assert found["before"] > 0.1
     assert found["orders"][0]["relative"] < 1e-9
     # So do verdicts.
-    for question in (("--within", "0.01"), ("--within", "1%"), ("--below", "0.01")):
+    for question in (("--within", "0.01"), ("--within", "1%")):
         assert call("compare", "turned.off", "still.off", *question, folder=folder).returncode == 1
         judged = json.loads(
             output("compare", "turned.off", "still.off", *question, "--align", "--format", "json", folder=folder)
@@ -169,7 +169,7 @@ REFUSED = [
     # Before anything is read; what could be written is not touched.
     (f"report {STORE}x --output none/r.html", "none/r.html: the report cannot be written there"),
     ("compare no.ply no.ply --report none/page.html --within 1", "none/page.html: the report cannot be written there"),
-    ("compare no.ply no.ply --report . --below 1%", ".: the report cannot be written there: Is a directory"),
+    ("compare no.ply no.ply --report . --within 1%", ".: the report cannot be written there: Is a directory"),
     ("compare no.ply no.ply --report start.ply", "no.ply: cannot be read"),
     ("compare no.ply no.ply --report none", "no.ply: cannot be read"),
     ("fit start.ply no.ply -o target.ply", "no.ply: cannot be read"),
