@@ -68,7 +68,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "compare_studies": {"new": OPEN, "old": OPEN, "order": -3.0, "y": "relative", "methods": ["ico"]},
     "convergence": {"meshes": [A, B], "reference": B, **_ON_LATTICE},
     "distance": {"a": A, "b": B, **_ON_LATTICE, "memory": None},
-    "evolution": {"store": OPEN, "order": -3.0, "truth": None, "factor": 2.0},
+    "evolution": {"store": OPEN, "order": -3.0, "factor": 2.0},
     "fit": _OF_FITS,
     "fitting.align": {"a": A, "b": B, "order": -4.0},
     "fitting.gradient": {
@@ -102,7 +102,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "plot.energy": {"store": OPEN, "ax": None, "family": None},
     "plot.league": {"league": None, "ax": None},
     "plot.matrix": {"store": OPEN, "order": -3.0, "ax": None, "family": None},
-    "plot.over_time": {"store": OPEN, "order": -3.0, "ax": None, "family": None, "truth": None},
+    "plot.over_time": {"store": OPEN, "order": -3.0, "ax": None, "family": None},
     "plot.spectrum": {"store": OPEN, "order": -3.0, "ax": None, "family": None},
     "plot.witness": {
         "store": OPEN,

@@ -401,20 +401,17 @@ def export_command(store: Location, output: Path, style: ExportFormat | None, or
 @click.command("time")
 @table_options
 @click.option(
-    "--truth", metavar="FAMILY", help="Measure from this family, which is the true surface. [default: the reference]"
-)
-@click.option(
     "--factor",
     type=click.FloatRange(min=1.0, min_open=True),
     default=2.0,
     show_default=True,
     help="Report when the distance has grown by this factor.",
 )
-def time_command(store: Location, style: Format, orders: ChosenOrders, truth: str | None, factor: float) -> None:
+def time_command(store: Location, style: Format, orders: ChosenOrders, factor: float) -> None:
     """Print distances of moving meshes over time."""
     from sobolev_batch.extras.leagues.evolution import format_evolution
 
-    echo_lines(format_evolution(store, style, orders, truth=truth, factor=factor), style)
+    echo_lines(format_evolution(store, style, orders, factor=factor), style)
 
 
 @click.command("league")

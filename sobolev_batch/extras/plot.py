@@ -74,12 +74,10 @@ def over_time(
     ax: Axes | None = None,
     *,
     family: Families = None,
-    truth: str | None = None,
 ) -> Axes:
     """Plot the distances of meshes that move, with a dotted line at the first time at which a new mesh pays.
 
-    The truth is the family of the true surface at the same times; default the study's reference. The other parameters
-    are those of `convergence`.
+    The parameters are those of `convergence`.
 
     >>> import sobolev_batch as sb
     >>> sb.plot.over_time("storage/icosphere.zarr", order=-10)
@@ -87,7 +85,7 @@ def over_time(
         ...
     sobolev_batch.errors.InputError: ...
     """
-    return _plot("over-time", Selection.from_store(store, order, family, truth=truth), ax)
+    return _plot("over-time", Selection.from_store(store, order, family), ax)
 
 
 def matrix(store: AnyStore, order: float | None = None, ax: Axes | None = None, *, family: Families = None) -> Axes:

@@ -133,8 +133,8 @@ def _draw_slope(axes: Axes, places: Reals, values: Reals, slope: int) -> None:
 
 
 def draw_evolution(selection: Selection, order: float, axes: Axes) -> None:
-    """Draw the distances of moving meshes from the true surface over time, one line for each family."""
-    distances = evolution(selection.tree, order, truth=selection.truth).isel(order=0)
+    """Draw the distances of moving meshes from the reference over time, one line for each family."""
+    distances = evolution(selection.tree, order).isel(order=0)
     names = [name for name in moving_families(selection) if name in distances["family"].values]
     if not names:
         raise InputError(f"none of the chosen families moves, only {', '.join(distances['family'].values.tolist())}")
@@ -151,7 +151,7 @@ def draw_evolution(selection: Selection, order: float, axes: Axes) -> None:
             axes.axvline(moment, color=style["color"], linestyle=":", linewidth=1)
     if is_marked:
         axes.plot([], [], ":", color="gray", linewidth=1, label="a new mesh pays")
-    set_title(axes, f"order {order:g}", f"not drawn: {zeros} equal to the true surface" if zeros else "")
+    set_title(axes, f"order {order:g}", f"not drawn: {zeros} equal to the reference" if zeros else "")
     axes.set_xlabel("time")
     axes.set_ylabel("Sobolev distance")
 

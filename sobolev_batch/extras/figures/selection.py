@@ -35,14 +35,12 @@ class Selection:
 
     Attributes:
         x: Horizontal axis of convergence.
-        truth: Family of the true surface of meshes that move; default the reference.
     """
 
     tree: xr.DataTree
     orders: tuple[float, ...]
     families: tuple[str, ...]
     x: str = EDGE_LENGTH
-    truth: str | None = None
 
     @classmethod
     def from_store(
@@ -51,12 +49,11 @@ class Selection:
         order: Orders | None = None,
         family: Families = None,
         x: str = EDGE_LENGTH,
-        truth: str | None = None,
     ) -> Self:
         """Choose any orders, default the study's, and families by names or globs; InputError for an unknown family."""
         tree = as_tree(store)
         orders = finished_group(tree, "convergence")["order"].values.tolist() if order is None else check_orders(order)
-        return cls(tree, tuple(orders), tuple(chosen_families(tree, family)), x, truth)
+        return cls(tree, tuple(orders), tuple(chosen_families(tree, family)), x)
 
     @cached_property
     def styles(self) -> Mapping[str, Style]:

@@ -9,14 +9,12 @@ import xarray as xr
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.norms.columns import NUMBER, VARIABLES, described
-from sobolev_batch.sources.names import quoted
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
+from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, reference_of
 from sobolev_batch.tables.other_orders import convergence_at
 from sobolev_batch.tables.rendering import Column, Section, rendered
-from sobolev_batch.tables.store_accessor import StoreAccessor
 from sobolev_batch.tables.text import with_error, wrapped
-from sobolev_batch.transform.lattice import Orders, check_orders
+from sobolev_batch.transform.lattice import Orders
 
 # A mesh whose distance has grown by this factor since its first time is worth a new one.
 REMESHING_FACTOR = 2.0
@@ -26,27 +24,23 @@ If a new mesh of as many triangles would be as near as the first one, it pays on
 distance has certainly grown to {factor:g} times that of the first time."""
 
 
-def evolution(
-    store: AnyStore, order: Orders | None = None, *, truth: str | None = None, factor: float = REMESHING_FACTOR
-) -> xr.Dataset:
-    """Return the distances of moving meshes from the true surface over time, and when a new mesh pays.
+def evolution(store: AnyStore, order: Orders | None = None, *, factor: float = REMESHING_FACTOR) -> xr.Dataset:
+    """Return the distances of moving meshes from the study's reference over time, and when a new mesh pays.
 
     Args:
         store: Path, URL or opened DataTree of a store whose meshes have times.
         order: One order s < -1/2, or several; default all of the store.
-        truth: Family of the true surface at the same times, if it moves; default the study's reference.
         factor: Growth of the distance at which a new mesh pays, larger than 1.
 
     Returns:
         Dataset over `family`, `time` and `order`, float64: `distance` and its `error`, in the square root of a unit
-        length, `relative` and `relative_error` (over the norm of the true surface), and `growth`, the distance over
+        length, `relative` and `relative_error` (over the norm of the reference), and `growth`, the distance over
         that of the family's first time with a distance, NaN if that is not larger than its error. Over `family` and
         `order` it has `remesh_time`, the first time at which the distance has certainly grown by the factor; later it
         may fall again. NaN where a family has no mesh of a time, where no time is late enough, and without a growth.
 
     Raises:
-        InputError: The store has no tables yet, no mesh with a time or no such family, or the factor is not larger
-            than 1.
+        InputError: The store has no tables yet or no mesh with a time, or the factor is not larger than 1.
         OrderError: An order is not below -1/2.
         StoreError: The location has no store of a study.
 
@@ -67,18 +61,10 @@ def evolution(
     if not is_finite_number(factor) or factor <= 1:
         raise InputError(f"the factor must be larger than 1, found {factor!r}")
     tree = as_tree(store)
-    # Distances to a surface that moves are computed for each time.
-    convergence = convergence_at(tree, order) if truth is None else finished_group(tree, "convergence")
-    orders = convergence["order"].values.tolist() if order is None else list(check_orders(order))
-    meshes, complete = _moving_meshes(tree, truth), set(complete_meshes(tree))
-    frames = []
+    convergence, meshes = convergence_at(tree, order), _moving_meshes(tree)
+    orders, frames = convergence["order"].values.tolist(), []
     for row in meshes.itertuples(index=False):
-        known = None
-        if truth is None:
-            known = convergence.sel(mesh=row.mesh, order=orders)
-        elif {row.mesh, row.true} <= complete:
-            known = StoreAccessor(tree).distance(orders, row.mesh, row.true)
-        numbers = {name: np.nan if known is None else known[name].values for name in _NUMBERS}
+        numbers = {name: convergence[name].sel(mesh=row.mesh).values for name in _NUMBERS}
         frames.append(pd.DataFrame({"family": row.family, "time": row.time, "order": orders, **numbers}))
     table: xr.Dataset = pd.concat(frames, ignore_index=True).set_index(["family", "time", "order"]).to_xarray()
     found = table.reindex(family=meshes["family"].unique().tolist(), time=sorted(meshes["time"].unique()), order=orders)
@@ -103,12 +89,11 @@ def format_evolution(
     style: Format = "text",
     orders: Sequence[float] | None = None,
     *,
-    truth: str | None = None,
     factor: float = REMESHING_FACTOR,
 ) -> str:
     """Return the distances of moving meshes as text; see `evolution`."""
     tree = as_tree(store)
-    found = evolution(tree, orders, truth=truth, factor=factor)
+    found = evolution(tree, orders, factor=factor)
     columns = [*_NUMBERS, "growth"]
     frame: pd.DataFrame = found[columns].to_dataframe().dropna(how="all").reset_index()
     names = found["family"].values.tolist()
@@ -120,7 +105,7 @@ def format_evolution(
             {"time": time, **{f"family {name}": _cell(rows.sel(time=time)) for name, rows in families.items()}}
             for time in found["time"].values.tolist()
         ]
-        caption = f"Sobolev distance of order {order:g} to {truth or reference_of(tree)} over time, in % of its norm"
+        caption = f"Sobolev distance of order {order:g} to {reference_of(tree)} over time, in % of its norm"
         moments = [f"{name}: {_moment(rows, factor)}" for name, rows in families.items()]
         sections.append(Section(caption, [(table, cells)], moments))
     notes = wrapped(_NOTE.format(factor=factor))
@@ -132,28 +117,14 @@ def has_times(tree: xr.DataTree) -> bool:
     return "time" in finished_group(tree, "meshes", load=False).coords
 
 
-def _moving_meshes(tree: xr.DataTree, truth: str | None) -> pd.DataFrame:
-    """Return mesh, family and time of the meshes with times; and true, the mesh of the true surface, if that moves."""
+def _moving_meshes(tree: xr.DataTree) -> pd.DataFrame:
+    """Return mesh, family and time of the meshes with times, but for the reference."""
     group = finished_group(tree, "meshes")
     columns = {name: group[name].values for name in ("mesh", "family", "time") if has_times(tree)}
     meshes = pd.DataFrame(columns, columns=["mesh", "family", "time"]).dropna(subset="time")
-    meshes = meshes.drop_duplicates(["family", "time"], keep="last")
+    meshes = meshes[meshes["mesh"] != reference_of(tree)].drop_duplicates(["family", "time"], keep="last")
     if meshes.empty:
         raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
-    if truth is not None and truth not in set(meshes["family"]):
-        raise InputError(f"no family {quoted(truth)} has times, only {', '.join(meshes['family'].unique())}")
-    is_true = meshes["family"] == (reference_of(tree) if truth is None else truth)
-    true, meshes = meshes[is_true], meshes[~is_true]
-    if meshes.empty:
-        raise InputError("no mesh has a time, except those that the others are compared with")
-    if truth is None:
-        return meshes
-    # A time may have been computed in another way: 0.3 is 0.1 + 0.2.
-    is_at = np.isclose(meshes["time"].to_numpy()[:, None], true["time"].to_numpy(), rtol=1e-9, atol=0.0)
-    meshes = meshes.assign(true=np.where(is_at.any(axis=1), true["mesh"].to_numpy()[is_at.argmax(axis=1)], ""))
-    for name, rows in meshes.groupby("family", sort=False):
-        if not rows["true"].any():
-            raise InputError(f"the families {quoted(str(name))} and {quoted(truth)} have no time in common")
     return meshes
 
 

@@ -15,7 +15,6 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch.extras.leagues.evolution import format_evolution
 from tests.support.browser import browser
-from tests.support.members import loaded, members
 from tests.support.mesh_files import off
 from tests.support.studies import small_table, variable
 
@@ -29,7 +28,7 @@ def carried(level: int, times: list[float]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two meshes that a flow carries, against the true surface: a fine one that it carries along."""
+    """Meshes that a flow carries away from the reference."""
     folder = tmp_path_factory.mktemp("moving")
     family = [
         {"name": "coarse", **carried(1, [0.0, 0.4, 0.8])},
@@ -60,34 +59,21 @@ def test_distances_are_those_to_the_reference(store: Path) -> None:
     assert np.array_equal(late[:2], [np.nan, 1.0], equal_nan=True)
 
 
-def test_the_true_surface_may_move(store: Path) -> None:
-    found = sb.evolution(store, [-4.0, -2.0], truth="true")
-    assert found["family"].values.tolist() == ["coarse", "late"]
-    for family, level in (("coarse", 1), ("late", 2)):
-        mesh, true = (loaded(members(carried(one, [0.8]))[0]) for one in (level, 4))
-        expected = sb.distance(mesh, true, [-4.0, -2.0], lattice=LATTICE)
-        there = found.sel(family=family, time=0.8)
-        for name, error in (("distance", "error"), ("relative", "relative_error")):
-            assert (abs(there[name].values - expected[name].values) <= (there[error] + expected[error]).values).all()
-    # Nobody knows where the true surface was at this time.
-    assert np.isnan(found["distance"].sel(time=1.2).values).all()
-
-
 def test_a_new_mesh_pays_once_the_distance_has_certainly_grown(store: Path) -> None:
-    growth = sb.evolution(store, -4.0, truth="true")["growth"].sel(family="coarse", order=-4.0).values
+    growth = sb.evolution(store, -4.0)["growth"].sel(family="coarse", order=-4.0).values
     assert 1 < growth[1] < growth[2]
     for factor, moment in ((0.9 * growth[1], 0.4), (0.9 * growth[2], 0.8), (1.1 * growth[2], np.nan)):
-        times = sb.evolution(store, -4.0, truth="true", factor=factor)["remesh_time"]
+        times = sb.evolution(store, -4.0, factor=factor)["remesh_time"]
         assert np.array_equal(times.sel(family="coarse").values, [moment], equal_nan=True)
 
 
 def test_text_and_data(store: Path) -> None:
     tree = sb.open_store(store)
-    text = format_evolution(tree, "text", [-4.0], truth="true", factor=1.01).splitlines()
-    assert text[0] == "Sobolev distance of order -4 to true over time, in % of its norm"
+    text = format_evolution(tree, "text", [-4.0], factor=1.01).splitlines()
+    assert text[0] == "Sobolev distance of order -4 to reference over time, in % of its norm"
     assert text[4].split()[4:] == ["1.00", "×"]
     assert "coarse: a new mesh first pays at time 0.4" in text
-    still = format_evolution(tree, "text", [-4.0], truth="true", factor=1e6)
+    still = format_evolution(tree, "text", [-4.0], factor=1e6)
     assert "coarse: the distance has at no time certainly grown to 1e+06 times the first" in still
     assert max(map(len, text)) <= 100
     frame = pd.read_csv(io.StringIO(format_evolution(tree, "csv")))
@@ -123,35 +109,15 @@ def test_a_first_distance_below_its_error_has_no_growth(store: Path) -> None:
     assert "nan" not in text
 
 
-def test_times_that_differ_by_rounding_are_the_same(client: Client, tmp_path: Path) -> None:
-    ball = {"source": "icosphere", "levels": [0]}
-    family = [
-        {"name": "carried", "source": "flow", "mesh": ball, "times": [0.1 + 0.2, 1000000.1, 1000000.2]},
-        {"name": "true", "source": "flow", "mesh": {**ball, "levels": [2]}, "times": [0.3]},
-    ]
-    study = small_table(lattice={"xi_max": 2.0, "M": 16}, norm={"orders": [-4.0]}, family=family)
-    store = tmp_path / "rounded.zarr"
-    sb.run(sb.Study.from_table(study), store, client)
-    found = sb.evolution(store, [-4.0, -4.0], truth="true")
-    assert np.isfinite(found["distance"].sel(time=0.1 + 0.2)).all()
-    assert found.sizes["order"] == 1
-    tree = sb.open_store(store).load()
-    assert {"1000000.1", "1000000.2"} <= set(format_evolution(tree).split())
-    meshes = tree["meshes"].to_dataset()
-    tree["meshes"] = xr.DataTree(meshes.assign_coords(time=meshes["time"].where(meshes["family"] != "true", 7.0)))
-    with pytest.raises(sb.errors.InputError, match="the families 'carried' and 'true' have no time in common"):
-        sb.evolution(tree, truth="true")
-
-
 def test_the_plot_has_a_line_for_each_family(store: Path) -> None:
-    axes = sb.plot.over_time(store, -4.0, truth="true")
+    axes = sb.plot.over_time(store, -4.0)
     (legend,) = axes.figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["coarse", "late", "a new mesh pays"]
+    assert [text.get_text() for text in legend.get_texts()] == ["coarse", "late", "true", "a new mesh pays"]
     assert axes.get_title() == "order -4"
-    late = sb.plot.over_time(store, -4.0, truth="true", family="l*")
+    late = sb.plot.over_time(store, -4.0, family="l*")
     assert late.lines[0].get_label() == "late"
-    with pytest.raises(sb.errors.InputError, match="none of the chosen families moves, only coarse, late"):
-        sb.plot.over_time(store, -4.0, truth="true", family="still")
+    with pytest.raises(sb.errors.InputError, match="none of the chosen families moves, only coarse, late, true"):
+        sb.plot.over_time(store, -4.0, family="still")
 
 
 def test_new_times_of_files_need_no_new_field(client: Client, tmp_path: Path) -> None:
@@ -169,10 +135,6 @@ def test_new_times_of_files_need_no_new_field(client: Client, tmp_path: Path) ->
     with pytest.raises(sb.errors.InputError, match="no mesh of the store has a time"):
         sb.evolution(store)
     assert sb.run(study(times="names"), store, client).computed == ()
-    with pytest.raises(
-        sb.errors.InputError, match="no mesh has a time, except those that the others are compared with"
-    ):
-        sb.evolution(store, truth="frames")
     found, table = sb.evolution(store, -4.0), sb.table(store).set_index("mesh")["distance"]
     assert found["time"].values.tolist() == [1.0, 2.0, 10.0]
     assert found["distance"].values.ravel().tolist() == [table[f"frames/frame_{number}"] for number in (1, 2, 10)]
@@ -194,7 +156,6 @@ def test_a_report_draws_them(store: Path, tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         ({"factor": 1.0}, "the factor must be larger than 1, found 1.0"),
-        ({"truth": "still"}, "no family 'still' has times, only coarse, late, true"),
         ({"order": -0.4}, "only for orders below -1/2, found -0.4"),
     ],
 )
