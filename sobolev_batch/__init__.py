@@ -11,7 +11,7 @@ The public names by subject:
   `largest_deviation` (between bounds), `proximity` (Hausdorff, Chamfer) and `vertex_distances`.
 - Meshes: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`; `fit` moves the
   vertices of one towards a target.
-- Fields: `fourier_transform` on a `Lattice`; `norm`, `distance`, `spectrum` and `witness` as methods, `field.sobolev`.
+- Fields: `fourier_transform` on a `Lattice`.
 - Studies: `Study`, `init_study`, `plan`, `run`, `submit`.
 - Stores: `open_store`, `status`, `verify`, `unlock`.
 - Meshes within a tolerance: `reduce`.
@@ -30,15 +30,11 @@ import lazy_loader
 # All modules together take seconds to import, in which the command line could not answer.
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-# xarray learns of the accessors `field.sobolev` and `tree.sobolev` with the first function that returns fields.
-_RETURN_FIELDS = ("fourier_transform", "open_store")
-
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return metadata.version("sobolev-batch")
-    if name in _RETURN_FIELDS:
-        import_module(f"{__name__}.tables.accessor")
     if name == "open_store":
+        # xarray learns of the accessor `tree.sobolev`.
         import_module(f"{__name__}.tables.store_accessor")
     return _load(name)

@@ -9,7 +9,6 @@ from .batch.verify import Verification as Verification
 from .extras.draft import StudyDraft as StudyDraft
 from .extras.leagues.costs import CostLeague as CostLeague
 from .extras.leagues.league import League as League
-from .tables.accessor import SobolevAccessor as SobolevAccessor
 from .tables.store_accessor import StoreAccessor as StoreAccessor
 
 __all__: list[str]

@@ -70,7 +70,7 @@ def test_every_public_name_is_there_with_its_text(site: Path) -> None:
     # Sections of docstrings became lists, and one name leads to another.
     assert "<li><strong>rtol:</strong>" in sections["distance"]
     assert 'href="#fourier_transform"' in sections["norm"]
-    assert "field.sobolev.norm(-2)" in sections["result_types.SobolevAccessor"]
+    assert "tree.sobolev.distance(-2)" in sections["result_types.StoreAccessor"]
 
 
 @pytest.mark.all

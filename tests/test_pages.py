@@ -178,9 +178,9 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
     )
     of_order = sb.table("storage/icosphere.zarr", -4).set_index("mesh")["distance"]
     assert found["bands"].sum("radius_bins").sel(mesh=levels).values == pytest.approx(of_order[levels] ** 2, rel=1e-12)
-    assert found["near_another"]["mesh"].values.tolist() == [levels[2], levels[3]]
+    assert found["to_another"].index.tolist() == [levels[1], levels[2], levels[3]]
     expected = sb.distance(
-        sb.shapes.icosphere(3), sb.shapes.Sphere(), [-3.5, -2.25], lattice=found["fields"].sobolev.lattice
+        sb.shapes.icosphere(3), sb.shapes.Sphere(), [-3.5, -2.25], lattice=sb.Lattice.from_field(found["fields"])
     )
     assert found["another"]["distance"].sel(mesh=levels[3]).values == pytest.approx(
         expected["distance"].values, rel=1e-6

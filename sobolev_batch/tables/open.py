@@ -39,8 +39,8 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
     Groups: fourier (the fields), spectra, meshes, norms, distances, convergence, records; where the study requests it
     also octaves and proximity. docs/store.md lists their variables with dimensions and units. All stay on disk until
     you ask for values of them. The root of several objects has meshes, convergence and proximity of all of them, with
-    the coordinate `object`. Fields and spectra are Dask arrays, unless the store is in memory; fields
-    have the accessor `field.sobolev`.
+    the coordinate `object`. Fields and spectra are Dask arrays, unless the store is in memory. The tree has the
+    accessor `tree.sobolev`.
 
     Args:
         store: Path or URL of the store.

@@ -27,7 +27,7 @@ _HALF_WEIGHT = 0.75
 class StoreAccessor:
     """Norms, distances and spectra of any order as methods of an open store: ``tree.sobolev.distance(-2)``.
 
-    They use the octaves beside the fields, if the study has some; `field.sobolev` and functions of fields do not.
+    They use the octaves beside the fields, if the study has some; functions of fields do not.
 
     Raises:
         InputError: In all methods: the tree does not say where it was opened, or no mesh with a field has that label.
