@@ -95,7 +95,7 @@ def objects_command(store: Location, style: Format, orders: ChosenOrders) -> Non
     "--below",
     metavar="FRACTION",
     required=True,
-    help="Take what is below this fraction of the norm of the reference, such as 0.01 or 1%.",
+    help="Take what is below FRACTION, such as 0.01 or 1%, of the norm of the reference.",
 )
 def smallest_command(store: Location, style: Format, orders: ChosenOrders, below: str) -> None:
     """Print the smallest mesh below a bound.

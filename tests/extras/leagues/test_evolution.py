@@ -71,7 +71,7 @@ def test_text_and_data(store: Path) -> None:
     tree = sb.open_store(store)
     text = format_evolution(tree, "text", [-4.0], factor=1.01).splitlines()
     assert text[0] == "Sobolev distance of order -4 to reference over time, in % of its norm"
-    assert text[4].split()[4:] == ["1.00", "×"]
+    assert text[4].split()[4:6] == ["1.00", "×"]
     assert "coarse: a new mesh first pays at time 0.4" in text
     still = format_evolution(tree, "text", [-4.0], factor=1e6)
     assert "coarse: the distance has at no time certainly grown to 1e+06 times the first" in still
