@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from glob import has_magic
 from itertools import chain, product, takewhile
 from pathlib import Path, PurePosixPath
 from string import Template
@@ -39,8 +38,6 @@ _AS_FINE = 0.8
 # The size of a mesh at an end of its name: cow_500, cow-1k7, cow 20.5, 500_cow.
 _NUMBER = r"\d+(?:[.,]\d+)?(?:[kKmM]\d*)?"
 _SIZE = re.compile(rf"^{_NUMBER}(?![^\W_])|{_NUMBER}$")
-# A word at the end of a name, of which so many may be that of references.
-_ENDING, _MOST_ENDINGS = re.compile(r"[ _.-][^\W\d_]+$"), 9
 _LONGEST_NAME = 100
 # Characters between the parts of a name.
 _BETWEEN = " _-."
@@ -95,8 +92,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     The reference is the mesh that is called original, reference, target or ground truth, or else the one with the most
     triangles. Each folder is a family; the meshes of a single folder are families by their names without the number at
     the end. Where several files are called references and others belong to them by name, the study has several
-    objects, and so it has where the names of files begin as those of finer ones, in any folder. References alone are
-    compared with decimated versions of themselves. Files are looked at, and only small ones are read.
+    objects, and so it has where the names of files begin as those of finer ones, in any folder. A mesh alone is
+    compared with decimated versions of itself. Files are looked at, and only small ones are read.
 
     Args:
         folder: Folder with meshes, in it or in folders below.
@@ -132,11 +129,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     if problem := _path_problem(str(below)):
         raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
     sizes, extents, left_out = _look_at(folder)
-    references = _references(sizes)
-    if not references and _REFERENCES.fullmatch(folder.resolve().name):
-        references = _references(sizes, are_all=True)
-    references = references or {"": _reference(folder, sizes, left_out)}
-    families = _families(_without_strangers(sizes, references.get("")), references)
+    references = _references(sizes) or {"": _reference(folder, sizes, left_out)}
+    families = _families(sizes, references)
     used = {*references.values(), *chain.from_iterable(families.values())}
     doubts = {
         str(path): doubt
@@ -146,13 +140,10 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         if (doubt := placement_doubt(extents[path], extents[references[name]]))
     }
     if "" in references:
-        doubts = _of_finer_files(used, sizes, references[""]) | doubts
-        lacks = "its name lacks that of the reference"
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
-        lacks = "no other mesh belongs to it by name, nor it to one"
-        alone = () if families else _originals(references, sizes, below)
-        sections, summary = alone or _several_objects(references, families, below)
+        sections, summary = _several_objects(references, families, below)
+    lacks = "no other mesh belongs to it by name, nor it to one"
     left_out |= {str(path): lacks for path in sizes if path not in used}
     name = _json(_free_name(folder.resolve().name, fallback="study"))
     text = _filled("study", name=name, sections="".join(f"\n{section}" for section in sections))
@@ -239,43 +230,26 @@ def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes")
     return next(candidate for candidate in numbered if caseless_key(candidate) not in known)
 
 
-def _references(sizes: Mapping[PurePosixPath, int], *, are_all: bool = False) -> dict[str, PurePosixPath]:
+def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
     """Return the references by their objects; none where all files are of one object.
 
-    There are several objects if several files are called references, as all are in a folder that is called so, of which
-    some have files of their names, or where there are no other files at all.
+    There are several objects if several files are called references, of which some have files of their names.
     """
-    called = [path for path in sizes if are_all or _is_called_reference(path)]
-    references = {_object_of(path): path for path in called} or _finest_of_names(sizes)
+    called = [path for path in sizes if _is_called_reference(path)]
+    references = {_object_of(path): path for path in called} or _continued(sizes)
     owners = {name for name, *_ in _owned(sizes, references)}
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called or references)
     is_refused = any(name_problem(name, _LONGEST_NAME, RESERVED) or name.startswith((".", "__")) for name in references)
-    if not are_different or is_refused:
-        return {}
-    # Names that others continue, as cow and cow_500, are those of one object.
-    known = {*map(caseless_key, references)}
-    is_alone = len(called) == len(sizes) and not any(
-        known.intersection(caseless_key(name) for name, _ in _names_in(path) if own.startswith(name))
-        - {caseless_key(own)}
-        for own, path in references.items()
-    )
-    return references if is_alone else {name: path for name, path in references.items() if name in owners}
+    return {name: path for name, path in references.items() if name in owners and are_different and not is_refused}
 
 
-def _finest_of_names(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
-    """Return the finest file of each object whose names begin alike: cow.ply, or all that end in a word as cow_high."""
-    endings = Counter(found[0] for path in sizes if (found := _ENDING.search(mesh_stem(path))))
-    usual = [ending for ending, count in endings.most_common(_MOST_ENDINGS) if count > 1]
-    return next(filter(None, (_continued(sizes, ending) for ending in ("", *usual))), {})
-
-
-def _continued(sizes: Mapping[PurePosixPath, int], ending: str) -> dict[str, PurePosixPath]:
-    """Return the files whose names without an ending others continue or have, in any folder, with fewer triangles.
+def _continued(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
+    """Return the files whose names others continue or have, in any folder, with fewer triangles.
 
     There are none if the others of most lack, as outputs that failed, or that of the finest file.
     """
     stems = {path: mesh_stem(path) for path in sorted(sizes, key=lambda path: sizes[path])}
-    finest = {caseless_key(stem.removesuffix(ending)): path for path, stem in stems.items() if stem.endswith(ending)}
+    finest = {caseless_key(stem): path for path, stem in stems.items()}
     owners = {}
     for path, size in sizes.items():
         stem = stems[path]
@@ -284,38 +258,14 @@ def _continued(sizes: Mapping[PurePosixPath, int], ending: str) -> dict[str, Pur
         found = (one for name, one in known if one and (stem.startswith(name) or sizes[one] > size))
         owners[path] = owner = next(found, finest.get(caseless_key(stem), path))
         # Files of one name may be of two methods, unless one is much finer.
-        if path != owner and size * (1 + (bool(ending) or stems[owner] == stem)) > sizes[owner]:
+        if path != owner and size * (1 + (stems[owner] == stem)) > sizes[owner]:
             return {}
-    own = {stems[path].removesuffix(ending): path for path, owner in owners.items() if path == owner}
+    own = {stems[path]: path for path, owner in owners.items() if path == owner}
     followed = {owner for path, owner in owners.items() if path != owner}
     if not followed <= {*own.values()} or 2 * len(followed) <= len(own):
         return {}
     is_finest = max(sizes[path] for path in followed) == max(sizes.values())
     return {name: path for name, path in own.items() if path in followed} if is_finest else {}
-
-
-def _without_strangers(paths: Iterable[PurePosixPath], reference: PurePosixPath | None) -> Iterable[PurePosixPath]:
-    """Return files without those beside the only reference that lack its name, where others have it."""
-    if reference is None:
-        return paths
-    name = caseless_key(_SIZE.sub("", _object_of(reference)).strip(_BETWEEN))
-    beside = [path for path in paths if path.parent == reference.parent and path != reference]
-    strange = {path for path in beside if name not in (caseless_key(one) for one, _ in _names_in(path))}
-    return [path for path in paths if path not in strange or len(strange) == len(beside)]
-
-
-def _of_finer_files(
-    paths: Iterable[PurePosixPath], sizes: Mapping[PurePosixPath, int], reference: PurePosixPath
-) -> dict[str, str]:
-    """Return a question for each file whose name a much finer one has, which is not the reference of the study."""
-    by_size = sorted(paths, key=lambda path: (sizes[path], natural_key(str(path))))
-    finest = {caseless_key(mesh_stem(path)): path for path in by_size}
-    doubt = (
-        f"a finer file has its name, and is not {reference}; if that is its reference, put all references into one "
-        "folder called originals, and write the study anew"
-    )
-    finer = {path: finest[caseless_key(mesh_stem(path))] for path in by_size}
-    return {str(path): doubt for path, one in finer.items() if one != reference and sizes[one] >= 2 * sizes[path]}
 
 
 def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]) -> _Families:
@@ -406,75 +356,33 @@ def _one_object(
         ends = dict.fromkeys(f"{end(sizes[member] for member in members):,}" for end in (min, max))
         size = f"{_count(len(members))}, {' to '.join(ends)} triangles"
         paths = "".join(f"    {_json(str(folder / member))},\n" for member in members)
-        sections.append(
-            _filled("family", name=_json(family), paths=paths, size=size, glob=_glob(members, sizes, folder))
-        )
+        sections.append(_filled("family", name=_json(family), paths=paths, size=size))
         summary.append(f"family {family}: {size}")
-    if min((sizes[path] for paths in families.values() for path in paths), default=0) >= _AS_FINE * triangles:
-        summary.append("are these objects of their own? if so, move them into a folder called originals, and init that")
+    others = [path for paths in families.values() for path in paths]
+    if others and all(sizes[path] >= _AS_FINE * triangles or _is_called_reference(path) for path in others):
+        summary.append(
+            "are these objects of their own? if so, add meshes with their names, such as METHOD/NAME_500.ply"
+        )
     if counts:
         sections.append(_filled("optional" if families else "decimated", counts=counts))
     return sections, tuple(summary)
-
-
-def _glob(members: Sequence[PurePosixPath], sizes: Iterable[PurePosixPath], folder: PurePosixPath) -> str:
-    """Return a remark with the glob that matches these files and no others that can be read; nothing without one."""
-    kinds = {(member.parent, member.suffix) for member in members}
-    if len(kinds) > 1 or len(members) != sum((path.parent, path.suffix) in kinds for path in sizes):
-        return ""
-    ((parent, suffix),) = kinds
-    place = str(folder / parent)
-    return "" if has_magic(place) else f"; [{_json(f'{place}/*{suffix}')}] would take new files too"
-
-
-def _originals(
-    references: Mapping[str, PurePosixPath], sizes: Mapping[PurePosixPath, int], folder: PurePosixPath
-) -> tuple[list[str], tuple[str, ...]]:
-    """Return the sections of a study of originals alone, which decimates them, and what they hold."""
-    templates = {str(folder / path).replace(name, OBJECT) for name, path in references.items()}
-    fewest = min(sizes[path] for path in references.values())
-    counts = [count for part in _FRACTIONS if (count := fewest // part) >= _FEWEST_TRIANGLES]
-    if len(templates) > 1 or not counts:
-        raise StudyError(
-            f"there are originals alone ({few_of([*map(str, references.values())])}), with nothing to compare; add "
-            f"meshes with their names, such as METHOD/{next(iter(references))}_500.ply"
-        )
-    (path,) = templates
-    summary = f"{_objects_text(references)}, each compared with decimated versions of itself"
-    return [_filled("originals", path=_json(path), counts=counts)], (summary,)
 
 
 def _several_objects(
     references: Mapping[str, PurePosixPath], families: _Families, folder: PurePosixPath
 ) -> tuple[list[str], tuple[str, ...]]:
     """Return the section of a study of several objects, which lists their meshes, and what it holds."""
-    listed = [(name, REFERENCE_LABEL, path, "") for name, path in references.items()]
-    for (name, method), paths in families.items():
-        own = [_size_of(path, name) for path in paths]
-        # Names of sizes, whatever other files there are: the same ones next time, if one of them is missing then.
-        is_named = all(own) and len({*own}) == len(own)
-        listed += [(name, method, path, one * is_named) for path, one in zip(paths, own, strict=True)]
+    listed = [(name, REFERENCE_LABEL, path) for name, path in references.items()]
+    listed += [(name, method, path) for (name, method), paths in families.items() for path in paths]
     meshes = "".join(
-        _filled(
-            "mesh",
-            name=_json(name),
-            method=_json(method),
-            own=f"name = {_json(own)}, " if own else "",
-            path=_json(str(folder / path)),
-        )
-        for name, method, path, own in listed
+        _filled("mesh", name=_json(name), method=_json(method), path=_json(str(folder / path)))
+        for name, method, path in listed
     )
-    counts = Counter(method for _, method, *_ in listed[len(references) :])
+    counts = Counter(method for _, method, _ in listed[len(references) :])
     return [_filled("objects", meshes=meshes)], (
         _objects_text(references),
         *(f"method {method}: {_count(count)}" for method, count in counts.items()),
     )
-
-
-def _size_of(path: PurePosixPath, name: str) -> str:
-    """Return the size that folders say of a file whose own name is that of its object, or nothing: 500/cow.ply."""
-    is_alone = caseless_key(mesh_stem(path)) == caseless_key(name)
-    return "-".join(part for part in path.parent.parts if _SIZE.fullmatch(part)) if is_alone else ""
 
 
 def _objects_text(names: Iterable[str]) -> str:

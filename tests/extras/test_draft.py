@@ -135,24 +135,6 @@ def test_several_objects(tmp_path: Path, layout: str) -> None:
     assert (found, summary[0].lower()) == (own, "2 objects: big cow, cow")
 
 
-@pytest.mark.parametrize("sizes", [("80",), ("80", "320")])
-def test_meshes_in_folders_of_sizes_have_the_same_names_if_others_are_missing(
-    tmp_path: Path, sizes: Sequence[str]
-) -> None:
-    paths = [f"quick/{size}/{name}.ply" for size, name in product(("80", "320"), ("big cow", "cow"))]
-    wanted = [path for path in paths if "big" not in path or path.split("/")[1] in sizes]
-    _, studies = drafted(tmp_path, *wanted, "originals/big cow.ply", "originals/cow.ply")
-    assert {*files_of(studies["big cow"])["quick"]} == {*sizes}
-    assert files_of(studies["cow"])["quick"] == {size: f"quick/{size}/cow.ply" for size in ("80", "320")}
-
-
-def test_meshes_beside_the_reference_that_lack_its_name_are_left_out_where_others_have_it(tmp_path: Path) -> None:
-    for path, level in (("cow_5k.ply", 3), ("cow_80.ply", 1), ("dog_80.ply", 1), ("out/80.ply", 1)):
-        write(tmp_path / path, level)
-    draft = sb.init_study(tmp_path, tmp_path / "study.toml")
-    assert draft.left_out == {"dog_80.ply": "its name lacks that of the reference"}
-
-
 @pytest.mark.parametrize(("level", "is_paired"), [(2, False), (3, True)])
 def test_files_of_one_name_belong_together_where_one_is_finer(tmp_path: Path, level: int, is_paired: bool) -> None:
     for number in range(3):
@@ -162,31 +144,16 @@ def test_files_of_one_name_belong_together_where_one_is_finer(tmp_path: Path, le
     assert (summary[0] == "3 objects: part_0, part_1, part_2") == is_paired
 
 
-def test_files_whose_name_a_finer_one_has_that_is_not_their_reference_are_doubtful(tmp_path: Path) -> None:
-    for number in range(3):
-        write(tmp_path / f"scans/part_{number}.ply", 2)
-        write(tmp_path / f"same/part_{number}.ply", 2)
-        write(tmp_path / f"low/part_{number}.ply", 1)
-    draft = sb.init_study(tmp_path, tmp_path / "study.toml")
-    assert draft.summary[0].startswith("reference ")
-    assert {"low/part_1.ply", "low/part_2.ply"} <= {*draft.doubtful}
-    assert {*draft.doubtful} <= {f"low/part_{number}.ply" for number in range(3)}
-    assert "originals" in str(draft)
-
-
-@pytest.mark.parametrize("end", ["", "_high", " scan"])
 @pytest.mark.parametrize(("lacking", "level", "found"), [("5", 2, 5), ("45", 3, 1), ("345", 2, 1)])
-def test_objects_need_no_other_mesh_if_most_have_one(
-    tmp_path: Path, lacking: str, level: int, found: int, end: str
-) -> None:
+def test_objects_need_no_other_mesh_if_most_have_one(tmp_path: Path, lacking: str, level: int, found: int) -> None:
     for number in "012345":
-        write(tmp_path / f"in/part_{number}{end}.ply", level if number in lacking else 2)
+        write(tmp_path / f"in/part_{number}.ply", level if number in lacking else 2)
         if number not in lacking:
             write(tmp_path / f"out/part_{number}_low.ply", 1)
     draft = sb.init_study(tmp_path, tmp_path / "study.toml")
     assert len(as_study(draft.path).objects) == found
     reason = "no other mesh belongs to it by name, nor it to one"
-    assert draft.left_out == (dict.fromkeys([f"in/part_5{end}.ply"], reason) if found > 1 else {})
+    assert draft.left_out == (dict.fromkeys(["in/part_5.ply"], reason) if found > 1 else {})
 
 
 @pytest.mark.parametrize("lacking", [1, 2])
@@ -203,50 +170,18 @@ def test_originals_without_other_meshes_are_named(tmp_path: Path, template: str,
     assert found.left_out == {template.format(name): reason for name in names[:lacking]}
 
 
-@pytest.mark.parametrize("template", ["originals/{}.ply", "{}_original.ply", "{}/original.ply"])
-def test_originals_alone_are_compared_with_their_decimations(tmp_path: Path, template: str) -> None:
-    for level, name in enumerate(("big cow", "cow"), start=2):
-        write(tmp_path / "meshes" / template.format(name), level)
-    found = sb.init_study(tmp_path / "meshes", tmp_path / "study.toml")
-    assert found.summary == ("2 objects: big cow, cow, each compared with decimated versions of itself",)
-    assert found.left_out == {}
-    for name, one in as_study(found.path).objects.items():
-        (reference,) = one.reference.members(tmp_path)  # type: ignore[union-attr]
-        assert reference.name == Path(template.format(name)).stem
-        assert [*one.members] == [*(f"quadric decimation/{count}" for count in (20, 40, 80, 160)), "reference"]
-
-
-def test_names_that_are_dates_are_those_of_a_family_that_new_files_may_join(tmp_path: Path) -> None:
+def test_names_that_are_dates_are_those_of_a_family(tmp_path: Path) -> None:
     for name in ("original.ply", "scans/2026-11-30_01.ply", "scans/2026-11-30_02.ply", "scans/2026-12-01_01.ply"):
         write(tmp_path / name, 1 + (name == "original.ply"))
     found = sb.init_study(tmp_path, tmp_path / "study.toml")
     assert [family.name for family in as_study(found.path).object.families] == ["scans"]
-    assert '["scans/*.ply"] would take new files too' in found.path.read_text(encoding="utf-8")
-    (tmp_path / "original.ply").rename(tmp_path / "scans" / "original.ply")
-    beside = sb.init_study(tmp_path, tmp_path / "beside.toml")
-    assert "would take new files" not in beside.path.read_text(encoding="utf-8")
 
 
-def test_a_folder_called_originals_holds_objects_of_their_own(tmp_path: Path) -> None:
-    """Meshes as fine as each other, in another folder, are taken for one object; then the draft asks."""
-    for folder, name in product(("scans", "Originals"), ("scan_1", "scan_2")):
-        write(tmp_path / folder / f"{name}.ply", 2)
-    one, several = (sb.init_study(tmp_path / folder, tmp_path / f"{folder}.toml") for folder in ("scans", "Originals"))
-    assert [*as_study(one.path).objects] == [""]
-    assert "objects of their own? if so, move them into a folder called originals, and init that" in str(one)
-    assert [*as_study(several.path).objects] == ["scan_1", "scan_2"]
-    assert "objects of their own" not in str(several)
-    for name in ("cow.ply", "cow_80.ply", "pig.ply", "pig_80.ply"):
-        write(tmp_path / "objects" / name, 1 + ("_" not in name))
-    with_versions = sb.init_study(tmp_path / "objects", tmp_path / "objects.toml")
-    assert [*as_study(with_versions.path).objects] == ["cow", "pig"]
-
-
-def test_originals_alone_whose_names_follow_no_pattern_need_other_meshes(tmp_path: Path) -> None:
-    for path in ("originals/cow.ply", "originals/egg.obj"):
-        write(tmp_path / path, 2)
-    with pytest.raises(sb.errors.StudyError, match=r"originals alone .*; add meshes .* such as METHOD/cow_500\.ply"):
-        sb.init_study(tmp_path, tmp_path / "study.toml")
+@pytest.mark.parametrize("folder", ["scans", "originals"])
+def test_meshes_that_may_be_objects_of_their_own_are_asked_about(tmp_path: Path, folder: str) -> None:
+    for name, level in (("scan_1", 2), ("scan_2", 2 - (folder == "originals"))):
+        write(tmp_path / folder / f"{name}.ply", level)
+    assert "are these objects of their own?" in str(sb.init_study(tmp_path, tmp_path / "study.toml"))
 
 
 def test_meshes_far_larger_than_their_reference_are_named(tmp_path: Path) -> None:
