@@ -360,9 +360,7 @@ def _one_object(
         summary.append(f"family {family}: {size}")
     others = [path for paths in families.values() for path in paths]
     if others and all(sizes[path] >= _AS_FINE * triangles or _is_called_reference(path) for path in others):
-        summary.append(
-            "are these objects of their own? if so, add meshes with their names, such as METHOD/NAME_500.ply"
-        )
+        summary.append("are these objects of their own? if so, add meshes with their names: METHOD/NAME_500.ply")
     if counts:
         sections.append(_filled("optional" if families else "decimated", counts=counts))
     return sections, tuple(summary)
