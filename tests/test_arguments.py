@@ -183,7 +183,7 @@ RIGHT: dict[str, dict[str, Any]] = {
         "folder": ".",
         "distances": False,
     },
-    "yardsticks": {"a": A, "b": B, **_ON_LATTICE, "memory": None, "changes": ("moved",)},
+    "yardsticks": {"a": A, "b": B, **_ON_LATTICE, "memory": None},
 }
 
 

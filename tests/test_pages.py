@@ -217,7 +217,6 @@ def test_the_page_about_surfaces_that_move_runs(
     carried, files = blocks("docs/moving.md", "toml")
     study = tomllib.loads(carried)
     simulated = {**study, "family": [*study["family"], *tomllib.loads(files)["family"]]}
-    simulated["family"].append({**simulated["family"][0], "name": "fine", "times": [0.0, 0.25]})
     monkeypatch.chdir(tmp_path)
     Path("frames").mkdir()
     Path("storage").mkdir()

@@ -27,11 +27,11 @@ from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.distances import distance
-from sobolev_batch.norms.yardsticks import CHANGES, yardsticks
+from sobolev_batch.norms.yardsticks import yardsticks
 from sobolev_batch.parameters import fraction
 from sobolev_batch.plugins import FEATURES, extra
 from sobolev_batch.tables.rendering import printed_table
-from sobolev_batch.tables.text import bound, count_text, percent, rounded, second_digit, with_error
+from sobolev_batch.tables.text import bound, percent, rounded, second_digit, with_error
 from sobolev_batch.testing.difference import require_place, write_difference
 from sobolev_batch.testing.verdict import same_surface
 from sobolev_batch.testing.within import deviation_text, judge_deviation
@@ -81,7 +81,6 @@ class CompareOptions:
     best_effort: bool
     xi_max: float | None
     intervals: int | None
-    yardsticks: bool
     proximity: bool
     threshold: float | None
     align: bool
@@ -194,7 +193,7 @@ class Comparison:
         first: The mesh of A in the unit of the file, where it was moved to.
         second: That of B.
         similarity: From this unit to that of the distances.
-        results: What `yardsticks` returns, of moves alone if no others were asked for.
+        results: What `yardsticks` returns.
         nearness: What `proximity` returns, in the unit of the files; None if not asked for.
         deviations: Largest deviations in this unit; None if it has no name and `proximity` was not asked for.
         before: The distance before A was moved; None if that was not asked for.
@@ -234,8 +233,7 @@ class Comparison:
             nearness, deviations = proximity_and_deviations(first, second, threshold=options.threshold)
         elif options.unit is not None:
             deviations = largest_deviation(first, second)
-        changes = CHANGES if options.yardsticks else ("moved",)
-        results = yardsticks(*pair, orders, **accuracy, changes=changes, on_progress=show_step)
+        results = yardsticks(*pair, orders, **accuracy, on_progress=show_step)
         return cls(options, first, second, similarity, results, nearness, deviations, before, doubt)
 
     @property
@@ -297,9 +295,8 @@ class Comparison:
         # Of equal meshes there is no more to tell.
         unequal = [result for result in by_order if result["distance"] > 0]
         for result in unequal:
-            name, reference = map(visible, self.options.names)
-            text = likeness(name, reference, result, self.second.bounding_sphere[1], self.unit)
-            yield from text.split("\n") if text else ()
+            if text := likeness(visible(self.options.names[1]), result, self.second.bounding_sphere[1], self.unit):
+                yield text
         for result in unequal:
             if rtol is not None and not result["within"]:
                 yield f"order {result['order'].item():g}: the error is more than rtol {rtol:g}"
@@ -433,37 +430,20 @@ def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], 
     return f"{name} differs from {reference} by {amount} {at_order}: not resolved."
 
 
-def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float], radius: float, unit: str) -> str:
-    """Return sentences about changes that bring the reference as far from itself, from `yardsticks` at one order.
+def likeness(reference: str, result: xr.Dataset | Mapping[str, float], radius: float, unit: str) -> str:
+    """Return a sentence on the move that brings the reference as far from itself; nothing where none does.
 
-    The radius is that of the reference in a unit. Without noise and decimation there is one sentence about the move.
+    The radius is that of the reference in a unit.
 
-    >>> amounts = {"order": -2.0, "moved": 0.0081, "noise": 0.0032, "decimated": 2312.0}
-    >>> errors = {"moved_error": 1e-4, "noise_error": 1e-4, "decimated_error": 40.0}
-    >>> print(likeness("small.obj", "large.obj", {**amounts, **errors}, 50.0, "mm"))
-    At order -2, small.obj is as far from large.obj as
-      large.obj moved by 0.81 % of its radius, 0.405 mm,
-      large.obj with noise of 0.32 % of its radius, 0.160 mm,
-      large.obj decimated to 2,300 triangles.
+    >>> likeness("large.obj", {"order": -2.0, "moved": 0.0081, "moved_error": 1e-4}, 50.0, "mm")
+    'At order -2, this is as far as large.obj moved by 0.81 % of its radius, 0.405 mm.'
     """
-    kinds = [kind for kind in ("moved", "noise", "decimated") if kind in result]
-    amounts = {kind: float(result[kind]) for kind in kinds if not math.isnan(result[kind])}
-    errors = {kind: max(float(result[f"{kind}_error"]), second_digit(amount)) for kind, amount in amounts.items()}
-
-    def length(kind: str) -> str:
-        fraction, own = (rounded(size * amounts[kind], size * errors[kind]) for size in (100.0, radius))
-        return f"{fraction} % of its radius, {own} {unit}"
-
-    wordings = {"moved": "moved by {}", "noise": "with noise of {}"}
-    texts = [f"  {reference} {wordings[kind].format(length(kind))}" for kind in amounts if kind in wordings]
-    if "decimated" in amounts:
-        texts.append(f"  {reference} decimated to {count_text(amounts['decimated'], errors['decimated'])} triangles")
-    at_order = f"At order {float(result['order']):g}, "
-    if kinds == ["moved"]:
-        return f"{at_order}this is as far as{texts[0][1:]}." if texts else ""
-    if not texts:
-        return f"{at_order}no move, noise or decimation of {reference} is known to be as far from it."
-    return f"{at_order}{name} is as far from {reference} as\n" + ",\n".join(texts) + "."
+    if math.isnan(moved := float(result["moved"])):
+        return ""
+    error = max(float(result["moved_error"]), second_digit(moved))
+    fraction, own = (rounded(size * moved, size * error) for size in (100.0, radius))
+    at_order = f"At order {float(result['order']):g}"
+    return f"{at_order}, this is as far as {reference} moved by {fraction} % of its radius, {own} {unit}."
 
 
 def _share_text(result: xr.Dataset | Mapping[str, float], area_change: float) -> str:

@@ -70,7 +70,6 @@ _STATUSES = {"same": 0, "within": 0, "different": 1, "not within": 1, "undecided
     metavar="M",
     help="Divide each axis of the lattice into M intervals, in place of --rtol. [default: 64 with --xi-max]",
 )
-@click.option("--yardsticks", is_flag=True, help="Print which move, noise and decimation bring B as far from itself.")
 @click.option(
     "--proximity", is_flag=True, help="Also print distances of points: the largest deviation, mean, RMS and others."
 )

@@ -126,15 +126,6 @@ def rounded_outwards(lower: float, upper: float, digits: int = 2) -> tuple[str, 
     return _shown(low, _magnitude(low) - digits + 1), _shown(high, _magnitude(high) - digits + 1)
 
 
-def count_text(number: float, error: float) -> str:
-    """Return a large number of things with the digits that its error leaves it.
-
-    >>> count_text(2312.4, 36.0)
-    '2,310'
-    """
-    return "" if math.isnan(number) else f"{round(number, -max(0, _magnitude(_rounded_up(error, 1)))):,.0f}"
-
-
 def second_digit(value: float) -> float:
     """Return the unit of the second digit of a number.
 
