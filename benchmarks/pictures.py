@@ -184,11 +184,14 @@ def _draw_one_per_cent(meshes: Path, path: Path) -> None:
         shutil.copy(meshes / "spot_23k.obj", made)
         twice = sb.Mesh(cow.vertices, np.concatenate([cow.triangles, cow.triangles[patch]]))
         sb.write_mesh(twice, f"{made}/patch.ply")
+        radius, sizes = cow.bounding_sphere[1], np.random.default_rng(0).standard_normal(len(cow.vertices))
+        moves = 0.0015 * radius * sizes[:, None] * cow.to_trimesh().vertex_normals
+        sb.write_mesh(sb.Mesh(cow.vertices + moves, cow.triangles), f"{made}/noisy.ply")
         study = _cow_study(
             "one-per-cent",
             [-2.0],
             {"name": "decimated", "source": "decimate", "mesh": "cow", "triangles": [1360]},
-            {"name": "noisy", "source": "noisy", "mesh": "cow", "amplitudes": [0.0015]},
+            {"name": "noisy", "source": "files", "paths": ["noisy.ply"]},
             {"name": "duplicated", "source": "files", "paths": ["patch.ply"]},
         )
         store = _store(study, Path(made))

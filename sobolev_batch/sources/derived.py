@@ -1,4 +1,4 @@
-"""Families of one other mesh: coarser, displaced, or carried along by a flow; docs/studies.md has their keys."""
+"""Families of one other mesh: coarser, or carried along by a flow; docs/studies.md has their keys."""
 
 import warnings
 from collections.abc import Callable
@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Point, normals
-from sobolev_batch.sources.generated import Levels, Triple
+from sobolev_batch.sources.generated import Levels
 from sobolev_batch.sources.registry import MadeMember, Member, NestedSource, OtherSource, Several, Times, single_member
 
 # Measured peak of simplifying and of clustering, for each triangle of the original.
@@ -23,13 +21,10 @@ _MOST_TRIANGLES = 10**9
 # Even cells need several input vertices for each output vertex; pyacvd advises to subdivide until there are.
 _VERTICES_PER_CLUSTER = 10
 
-# Raise it whenever a mesh is displaced or carried in another way.
+# Raise it whenever a mesh is carried in another way.
 _VERSION = 1
-# Measured peaks of displacing a mesh and of carrying it along, for each of its triangles.
-_DISPLACING_BYTES, _CARRYING_BYTES = 400, 200
-
-# Lengths as fractions of the radius of the mesh's bounding sphere.
-Fractions = Several[Annotated[float, Field(gt=0, allow_inf_nan=False)]]
+# Measured peak of carrying a mesh along, for each of its triangles.
+_CARRYING_BYTES = 200
 
 
 def decimated(mesh: Mesh, triangles: int, keep_boundary: bool = False) -> Mesh:
@@ -181,39 +176,6 @@ def _first_vertices(surface: Mesh, sphere: Mesh, level: int) -> Mesh:
     return Mesh(surface.vertices[:count], hull.simplices.astype(np.int64))
 
 
-class MovedSource(NestedSource):
-    """A mesh moved by some distances, as fractions of the radius of its bounding sphere."""
-
-    distances: Fractions
-    direction: Triple = (1.0, 0.0, 0.0)
-
-    @field_validator("direction")
-    @classmethod
-    def _check_direction(cls, direction: Point) -> Point:
-        if not any(direction):
-            raise ValueError("must not be zero")
-        return direction
-
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return one member for each distance, the smallest first."""
-        direction = (np.asarray(self.direction) / np.linalg.norm(self.direction)).tolist()
-        return _displaced("moved", single_member(self.mesh, folder), self.distances, _moved, direction=direction)
-
-
-class NoisySource(NestedSource):
-    """A mesh whose vertices are displaced along its normals at random; see `with_noise`.
-
-    Amplitudes are fractions of the radius of its bounding sphere. The noise is the same for all, but for its size.
-    """
-
-    amplitudes: Fractions
-    seed: Annotated[int, Field(ge=0)] = 0
-
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return one member for each amplitude, the smallest first."""
-        return _displaced("noisy", single_member(self.mesh, folder), self.amplitudes, _noisy, seed=self.seed)
-
-
 class FlowSource(NestedSource):
     """A mesh at several times, with its vertices carried along by a flow on the spheres around the origin.
 
@@ -238,47 +200,6 @@ class FlowSource(NestedSource):
             made(repr(time), -1, carried, {"time": time, **about}, (time, *settings), time=time)
             for time in sorted(self.times)
         )
-
-
-def _displaced(
-    kind: str, original: Member, amounts: tuple[float, ...], displace: Callable[..., Mesh], **settings: Any
-) -> tuple[Member, ...]:
-    """Return a member for each fraction of the radius by which a mesh is displaced, the smallest first."""
-    made = partial(MadeMember, originals={kind: original}, triangle_bytes=_DISPLACING_BYTES)
-    about = {"version": _VERSION, **settings}
-    return tuple(
-        made(f"{amount:g}", -1, displace, {"amount": amount, **about}, (amount, *settings.values()))
-        for amount in sorted(set(amounts))
-    )
-
-
-def _moved(mesh: Mesh, amount: float, direction: Point) -> Mesh:
-    return Mesh(mesh.vertices + amount * mesh.bounding_sphere[1] * np.asarray(direction), mesh.triangles)
-
-
-def _noisy(mesh: Mesh, amount: float, seed: int) -> Mesh:
-    return with_noise(mesh, amount * mesh.bounding_sphere[1], seed)
-
-
-def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
-    """Return a mesh whose vertices are displaced along its normals by independent Gaussian numbers.
-
-    Vertices at the same place are displaced together, so that no cracks open. The amplitude is the standard deviation,
-    in units of length.
-    """
-    places, place_of_vertex = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    directions = _vertex_normals(places, place_of_vertex[mesh.triangles])
-    sizes = amplitude * np.random.default_rng(seed).standard_normal(len(places))
-    return Mesh((places + sizes[:, None] * directions)[place_of_vertex], mesh.triangles)
-
-
-def _vertex_normals(vertices: Reals, triangles: Indices) -> Reals:
-    """Return the mean normal of the triangles at each vertex, weighted by area, (m, 3); zero where they cancel."""
-    crosses = normals(vertices, triangles)
-    columns = [np.bincount(triangles.ravel(), np.repeat(column, 3), len(vertices)) for column in crosses.T]
-    sums = np.stack(columns, axis=1)
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.asarray(np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0))
 
 
 def carried(mesh: Mesh, time: float, period: float, strength: float) -> Mesh:

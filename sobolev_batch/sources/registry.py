@@ -45,8 +45,6 @@ _OWN = {
     "flow": f"{_HERE}.derived:FlowSource",
     "function": f"{_HERE}.command:FunctionSource",
     "icosphere": f"{_HERE}.generated:IcosphereSource",
-    "moved": f"{_HERE}.derived:MovedSource",
-    "noisy": f"{_HERE}.derived:NoisySource",
     "remesh": f"{_HERE}.derived:RemeshSource",
     "sphere": f"{_HERE}.generated:SphereSource",
     "spherical-levels": f"{_HERE}.derived:SphericalLevelsSource",

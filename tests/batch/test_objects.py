@@ -629,7 +629,7 @@ def test_numbers_of_a_part_have_the_orders_of_its_study(
     assert "left out" not in caplog.text
 
 
-NOISY = [{"name": "noisy", "source": "noisy", "mesh": "ball", "amplitudes": [0.1]}]
+CARRIED = [{"name": "carried", "source": "flow", "mesh": "ball", "times": [0.1]}]
 
 
 @pytest.mark.parametrize(
@@ -638,10 +638,10 @@ NOISY = [{"name": "noisy", "source": "noisy", "mesh": "ball", "amplitudes": [0.1
         ({}, {"scaling": {"mode": "fixed", "scale": 0.5}}),
         ({}, {"transform": {"eps": 1e-7}}),
         *(
-            ({"mesh": {"ball": {"source": "icosphere", "levels": [1]}}, "family": NOISY}, own)
+            ({"mesh": {"ball": {"source": "icosphere", "levels": [1]}}, "family": CARRIED}, own)
             for own in (
                 {"mesh": {"ball": {"source": "icosphere", "levels": [2]}}},
-                {"family": [NOISY[0] | {"seed": 1}]},
+                {"family": [CARRIED[0] | {"strength": 1.0}]},
             )
         ),
     ],

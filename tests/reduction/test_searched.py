@@ -172,17 +172,17 @@ def test_a_search_goes_on_where_it_was_ended(folder: Path, monkeypatch: pytest.M
 
 
 def test_another_mesh_is_judged_against_the_reference(folder: Path) -> None:
-    start = {"source": "moved", "mesh": "scan", "distances": [0.03]}
-    sections: dict[str, Any] = {"mesh": {"scan": {"source": "files", "paths": ["scans/a.ply"]}}}
-    moved = load_mesh(member(folder, {**DECIMATED, "mesh": start}, **sections))
+    start, scan = {"source": "files", "paths": ["moved.ply"]}, sb.read_mesh(folder / "scans/a.ply")
+    sb.write_mesh(sb.Mesh(np.add(scan.vertices, [0.03, 0.0, 0.0]), scan.triangles), folder / "moved.ply")
+    moved = load_mesh(member(folder, {**DECIMATED, "mesh": start}))
     assert farthest(moved, lumpy(2)) <= 0.1
     assert len(load_mesh(member(folder, DECIMATED)).triangles) < len(moved.triangles) < 320
     # Already the mesh to start from is too far away.
-    start["distances"] = [0.2]
+    sb.write_mesh(sb.Mesh(np.add(scan.vertices, [0.2, 0.0, 0.0]), scan.triangles), folder / "moved.ply")
     with pytest.raises(
         sb.errors.MeshError, match=r"tolerance of 0\.1; nearest are \d+ triangles of the original itself, at least 0"
     ):
-        member(folder, {**DECIMATED, "mesh": start}, **sections).load()
+        member(folder, {**DECIMATED, "mesh": start}).load()
 
 
 def test_a_remesher_that_makes_the_same_of_each_size_is_told(threads: Client, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Meshes of one mesh: coarser, moved and noisy ones, and those of a flow, against its integrated velocity."""
+"""Meshes of one mesh: coarser ones, and those of a flow, against its integrated velocity."""
 
 from __future__ import annotations
 
@@ -16,52 +16,14 @@ import sobolev_batch as sb
 from sobolev_batch import Mesh
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.shapes import icosphere
-from sobolev_batch.sources.derived import carried, with_noise
+from sobolev_batch.sources.derived import carried
 from sobolev_batch.sources.registry import parse_source
 from tests.support.members import BALL, connectivity, listed, loaded, members
 from tests.support.mesh_files import off
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES, CLOSED
 
-# The ball has radius 1.
-MOVED: dict[str, Any] = {"source": "moved", "mesh": BALL, "distances": [0.3, 0.1], "direction": [0, 3, 4]}
-NOISY: dict[str, Any] = {"source": "noisy", "mesh": BALL, "amplitudes": [0.02, 0.01], "seed": 5}
 FLOW: dict[str, Any] = {"source": "flow", "mesh": {"source": "icosphere", "levels": [2]}, "times": [0.0]}
 KINDS = ["decimate", "remesh"]
-
-
-def displacements(table: dict[str, Any]) -> list[np.ndarray]:
-    start = np.asarray(icosphere(3).vertices)
-    return [np.asarray(loaded(member).vertices) - start for member in members(table)]
-
-
-def test_every_vertex_moves_by_a_fraction_of_the_radius() -> None:
-    assert listed(members(MOVED)) == [("0.1", -1), ("0.3", -1)]
-    for distance, moves in zip((0.1, 0.3), displacements(MOVED), strict=True):
-        np.testing.assert_allclose(moves, np.broadcast_to([0, 0.6 * distance, 0.8 * distance], moves.shape), atol=1e-12)
-    # A torus of radius 5, whose tube has corners at 60 degrees.
-    torus = {"source": "torus", "R": 4, "r": 1, "levels": [0]}
-    (member,) = members({**MOVED, "mesh": torus, "distances": [0.1]})
-    assert loaded(member).extent.box[1][2] == pytest.approx(3**0.5 / 2 + 0.8 * 0.5)
-
-
-def test_noise_is_gaussian_along_the_normals() -> None:
-    small, large = displacements(NOISY)
-    np.testing.assert_allclose(large, 2 * small, atol=1e-12)
-    normals = np.asarray(icosphere(3).vertices)
-    sizes = np.einsum("ij,ij->i", small, normals)
-    # Vertices of the icosphere lie along its normals, to the accuracy of the mesh.
-    assert np.abs(small - sizes[:, None] * normals).max() < 1e-3
-    assert sizes.std() == pytest.approx(0.01, rel=0.1)
-    assert abs(sizes.mean()) < 3 * 0.01 / np.sqrt(len(sizes))
-    assert not np.allclose(displacements({**NOISY, "seed": 6})[0], small)
-
-
-def test_noise_opens_no_cracks() -> None:
-    ball = icosphere(1)
-    corners = np.asarray(ball.vertices)[ball.triangles].reshape(-1, 3)
-    torn = Mesh(corners, np.arange(len(corners)).reshape(-1, 3))
-    places = np.asarray(with_noise(torn, 0.1, 0).vertices).round(12)
-    assert len(np.unique(places, axis=0)) == len(ball.vertices)
 
 
 def positions(time: float, **settings: Any) -> np.ndarray:

@@ -118,12 +118,6 @@ BAD: list[tuple[str, dict[str, Any], dict[str, list[Any]]]] = [
     ("remesh", COUNTS, NO_COUNTS),
     ("spherical-levels", {"mesh": BALL, "sphere": BALL, "levels": [1]}, {"sphere": [None, "a.ply"], **NO_LEVELS}),
     (
-        "moved",
-        {"mesh": BALL, "distances": [0.1]},
-        {"distances": [[]], "distances.0": [[0.0], ["0.1"], [True]], "direction": [[0, 0, 0]]},
-    ),
-    ("noisy", {"mesh": BALL, "amplitudes": [0.1]}, {"amplitudes.0": [[-0.1], ["0.1"]], "seed": [-1, 0.5]}),
-    (
         "flow",
         {"mesh": BALL, "times": [0.0]},
         {"times": [[], [0.0, True], [1.0, 1.0]], "period": [0.0, "5"], "strength": [True]},
@@ -235,8 +229,6 @@ def test_levels_go_from_coarse_to_fine_and_once_each() -> None:
         ({**RING, "levels": [1]}, [{"R": 3}, {"r": 0.6}, {"levels": [2]}, {"around": 13}, {"across": 7}]),
         (KINDS["flow"], [{"times": [0.25]}, {"strength": 2.0}, {"period": 5.0}, {"mesh": COARSER}]),
         (KINDS["spherical-levels"], [{"levels": [2]}, {"sphere": COARSER}, {"mesh": COARSER}]),
-        (KINDS["moved"], [{"distances": [0.1]}, {"direction": [0, 1, 0]}, {"mesh": COARSER}]),
-        (KINDS["noisy"], [{"amplitudes": [0.1]}, {"seed": 4}, {"mesh": COARSER}]),
         (KINDS["decimate"], [{"triangles": [81]}, {"mesh": COARSER}]),
         pytest.param(
             KINDS.get("fit"),

@@ -65,8 +65,8 @@ def test_a_named_mesh_is_the_source_that_it_names(box_file: Path) -> None:
     names = {"box": box, "fine": fine, "coarse": {"source": "decimate", "mesh": "fine", "triangles": [100]}}
 
     def families(box: Any, fine: Any, coarse: Any) -> list[dict[str, Any]]:
-        moved = {"name": "m", "source": "moved", "distances": [0.1], "mesh": coarse}
-        return [moved, {"name": "f", "source": "fit", "steps": 1, "mesh": fine, "target": box}]
+        carried = {"name": "m", "source": "flow", "times": [0.1], "mesh": coarse}
+        return [carried, {"name": "f", "source": "fit", "steps": 1, "mesh": fine, "target": box}]
 
     by_name = [*families("box", "fine", "coarse"), {"name": "b", "mesh": "box"}]
     named = plan_of(mesh=names, reference={"mesh": "box"}, family=by_name, folder=box_file.parent)

@@ -254,7 +254,7 @@ def test_families_without_a_mesh_are_made_of_the_reference() -> None:
     ball = {"source": "icosphere", "levels": [2]}
     coarse = {"source": "decimate", "triangles": [100]}
     kinds: list[dict[str, Any]] = [
-        {"source": "noisy", "amplitudes": [0.1]},
+        {"source": "flow", "times": [0.1]},
         {"source": "command", "command": ["made", "{input}", "{output}"]},
         coarse,
     ]

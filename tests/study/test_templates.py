@@ -211,7 +211,7 @@ def test_a_family_may_be_of_the_mesh_with_the_name_of_the_object() -> None:
         **small_table(reference=None),
         "mesh": {"ball": {"source": "icosphere", "levels": [2]}, "egg": {"source": "ellipsoid", "axes": [2, 1, 1]}},
         "object": [{"name": "ball", "reference": "ball"}, {"name": "egg", "reference": "egg"}],
-        "family": [{"name": "moved", "source": "moved", "mesh": "{object}", "distances": [0.1]}],
+        "family": [{"name": "carried", "source": "flow", "mesh": "{object}", "times": [0.1]}],
     }
     studies = sb.Study.from_table(table).objects
     assert {name: study.table["family"][0]["mesh"] for name, study in studies.items()} == {"ball": "ball", "egg": "egg"}

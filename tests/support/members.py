@@ -35,8 +35,6 @@ KINDS: dict[str, dict[str, Any]] = {
         "steps": 3,
         "triangles": [40, 24],
     },
-    "moved": {"source": "moved", "mesh": BALL, "distances": [0.1, 0.02], "direction": [0, 0, 2]},
-    "noisy": {"source": "noisy", "mesh": BALL, "amplitudes": [0.1, 0.02], "seed": 3},
     "flow": {"source": "flow", "mesh": BALL, "times": [2.0, 0.5], "period": 4.0, "strength": 1.0},
     "spherical-levels": {"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [2, 1]},
 }
