@@ -67,7 +67,9 @@ def parse_obj(data: bytes) -> Raw:
         elif not _OBJ_SKIPPED.fullmatch(kind):
             problem = "which is not read; export polygons" if kind in _OBJ_REFUSED else "no word of the OBJ format"
             raise MeshError(f"line {line_number} begins with {words[0][:40]!r}, {problem}")
-    return cut_polygons(np.array(vertices).reshape(-1, 3), np.array(corners), np.array(sizes))
+    # Files of millions of faces are hundreds of megabytes, and their arrays as many: neither is held twice.
+    del data
+    return cut_polygons(np.asarray(vertices).reshape(-1, 3), np.asarray(corners), np.asarray(sizes))
 
 
 def parse_off(data: bytes) -> Raw:

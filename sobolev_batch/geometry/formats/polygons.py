@@ -11,7 +11,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.parsing import Raw
 from sobolev_batch.geometry.mesh import cross, cross_lengths, dot
 
-# Quadrilaterals that are cut at a time: their corners and temporaries stay in cache.
+# Polygons that are cut at a time: their corners and temporaries stay in cache.
 _BATCH = 1 << 13
 # Cosines that differ by less are equal: those of bends below a ten thousandth, which single precision may have made.
 _EQUAL_COSINES = 1e-9
@@ -59,12 +59,17 @@ def cut_polygons(vertices: NDArray[Any], corners: Indices, sizes: Indices) -> Ra
     if (sizes == 4).all():
         return Raw(vertices, _cut_quads(axes, corners.reshape(-1, 4), found), _notes(found, size, len(sizes)))
     starts, parts, owners = np.cumsum(sizes) - sizes, [], []
-    for faces in (np.flatnonzero(sizes == 3), np.flatnonzero(sizes == 4), np.flatnonzero(sizes > 4)):
+    others = np.flatnonzero(sizes > 4)
+    batches = np.split(others, range(_BATCH, len(others), _BATCH))
+    for faces in (np.flatnonzero(sizes == 3), np.flatnonzero(sizes == 4), *batches):
         if not faces.size:
             continue
         number = sizes[faces[0]]
         if number > 4:
-            triangles, own = _cut_others(axes, corners[np.repeat(sizes > 4, sizes)], sizes[faces], found)
+            near = slice(faces[0], faces[-1] + 1)
+            of_near = corners[starts[faces[0]] : starts[faces[-1]] + sizes[faces[-1]]]
+            is_of_others = np.repeat(sizes[near] > 4, sizes[near])
+            triangles, own = _cut_others(axes, of_near[is_of_others], sizes[faces], found)
         else:
             triangles, own = corners[starts[faces, None] + np.arange(number)], np.arange(len(faces)).repeat(number - 2)
             triangles = triangles if number == 3 else _cut_quads(axes, triangles, found)
@@ -201,15 +206,15 @@ def _fans_and_ears(plane: Reals, sizes: Indices, is_convex: NDArray[np.bool_], t
     starts, owners = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes - 2)
     ranks = np.arange(len(owners)) - (np.cumsum(sizes - 2) - (sizes - 2))[owners]
     fans = starts[owners, None] + np.stack([np.zeros_like(ranks), ranks + 1, ranks + 2], axis=1)
-    parts, of_parts = [fans[is_convex[owners]]], [owners[is_convex[owners]]]
-    for one in np.flatnonzero(~is_convex):
+    parts, others = [fans[is_convex[owners]]], np.flatnonzero(~is_convex)
+    for one in others:
         own = slice(starts[one], starts[one] + sizes[one])
         ears = mapbox_earcut.triangulate_float64(plane[:, own].T.copy(), np.array(sizes[one : one + 1], np.uint32))
         # All ears face the same side. Without any the outline encloses nothing.
         ears = ears.reshape(-1, 3)[:, :: 1 if twice[one] > 0 else -1].astype(np.int64) + starts[one]
         parts.append(ears if len(ears) else fans[owners == one])
-        of_parts.append(np.full(len(parts[-1]), one))
-    return np.concatenate(parts), np.concatenate(of_parts)
+    of_others = np.repeat(others, [len(part) for part in parts[1:]])
+    return np.concatenate(parts), np.concatenate([owners[is_convex[owners]], of_others])
 
 
 def _most_around(x: Reals, y: Reals) -> int:

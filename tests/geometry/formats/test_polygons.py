@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -160,3 +161,16 @@ def test_faces_of_all_sizes_keep_their_order() -> None:
     raw = cut_polygons(vertices, np.arange(len(vertices)), sizes)
     owners = np.repeat(np.arange(50), sizes)[raw.triangles]
     assert (owners == np.repeat(np.arange(50), sizes - 2)[:, None]).all()
+
+
+def test_polygons_in_the_ten_thousands_take_little_more_memory_than_their_triangles() -> None:
+    # Between them stand triangles, and the area of each part is its own.
+    part, rows = np.array([*FLAT["L"][0], *FLAT["pentagon"][0], (0, 0), (1, 0), (0, 1)]), 15_000
+    vertices = np.concatenate([np.pad(part, ((0, 0), (0, 1)), constant_values=row) for row in range(rows)])
+    corners, sizes = np.arange(len(vertices)), np.tile([6, 5, 3], rows)
+    tracemalloc.start()
+    raw = cut_polygons(vertices, corners, sizes)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(Mesh(*raw).areas.reshape(rows, 8).sum(axis=1), 5 + 6 + 0.5, rtol=1e-12)
+    assert peak / len(raw.triangles) < 250
