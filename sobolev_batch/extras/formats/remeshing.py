@@ -81,6 +81,11 @@ def parse_gmsh(data: bytes) -> Raw:
     faces, repeated = [some[:, 1:] for some in kept], sum(len(some) for kind, some in rows if kind in _WITH_AREA)
     repeated -= sum(map(len, kept))
     volumes = sum(len(corners) for kind, corners in rows if kind in _WITH_VOLUME)
+    if volumes and b"$PartitionedEntities" in data:
+        raise MeshError(
+            "its volume is cut into partitions, and the faces between them are none of its surface; save it without: "
+            "gmsh scan.msh -save -format msh22 -o surface.msh"
+        )
     # Nodes have any numbers, in any order.
     order_of_nodes = np.argsort(numbered[:, 0])
     known = numbered[order_of_nodes, 0]

@@ -302,6 +302,7 @@ BOX_3MF = object_3mf(BOX_VERTICES, BOX_TRIANGLES)
 DOUBLED = (
     '<object id="2"><components><component objectid="1"/><component objectid="1" transform="{}"/></components></object>'
 )
+PARTITIONS = b"$PartitionedEntities\n2\n0\n0 0 0 0\n$EndPartitionedEntities\n"
 LINEAR, GMSH_OLD = gmsh(BOX_VERTICES, BOX_QUADS), gmsh_first_binary(BOX_VERTICES, BOX_MIXED)
 CASES |= {
     "medit, quadrilaterals": (".mesh", medit(BOX_VERTICES, BOX_QUADS), BOX_AREA),
@@ -384,6 +385,12 @@ CASES |= {
         )
         for spelling in (b"4.0D+00", b"4D0", b".4d1", b"400.d-2")
     },
+    "gmsh, partitions of a volume": (
+        ".msh",
+        replaced(gmsh(BOX_VERTICES, BOX_MIXED), (b"\n2 1 3\n", b"\n3 1 4\n")) + PARTITIONS,
+        "partitions, and the faces between them .*-format msh22",
+    ),
+    "gmsh, partitions of a surface": (".msh", LINEAR + PARTITIONS, BOX_AREA),
     "gmsh, no cells": (".msh", LINEAR.partition(b"$Elements")[0], "no section .Elements"),
     "3mf, placed twice": (
         ".3mf",
