@@ -25,6 +25,8 @@ from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips, unpacke
 from sobolev_batch.geometry.mesh import merge_coincident
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+# Of indices, so that negative ones, which count from the end, are as wrong as those beyond it.
+_INDEX = np.uint32
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Modes of primitives: points and lines have none of the area; triangles, strips and fans of them follow.
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -73,7 +75,7 @@ def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
         mesh = _entry(tree, "meshes", node["mesh"])
         for primitive in mesh["primitives"]:
             grow(0)
-            if primitive.get("mode", _TRIANGLES) < _TRIANGLES:
+            if primitive.get("mode", _TRIANGLES) in range(_TRIANGLES):
                 continue
             part = vertices, triangles = _primitive(file, primitive, node.get("weights", mesh.get("weights", [])))
             if "skin" in node:
@@ -149,7 +151,7 @@ class _File:
             values = np.zeros((count, _WIDTHS[kind]), _COMPONENTS[component])
         if sparse is not None:
             some, places, values = sparse["count"], sparse["indices"], values.copy()
-            rows = self._held(places, (some, 1), places["componentType"])[:, 0]
+            rows = self._held(places, (some, 1), places["componentType"])[:, 0].astype(_INDEX)
             values[rows] = self._held(sparse["values"], (some, _WIDTHS[kind]), component)
         if accessor.get("normalized"):
             values = np.maximum(values / np.iinfo(values.dtype).max, -1.0)
@@ -271,7 +273,7 @@ def _skinned(
     vertices, triangles = part
     found, total = np.zeros_like(vertices), np.zeros((len(vertices), 1))
     for group in takewhile(lambda group: f"JOINTS_{group}" in attributes, count()):
-        held = file.values(attributes[f"JOINTS_{group}"], "VEC4", len(vertices))
+        held = file.values(attributes[f"JOINTS_{group}"], "VEC4", len(vertices)).astype(_INDEX)
         weights = file.values(attributes[f"WEIGHTS_{group}"], "VEC4", len(vertices))
         for joint in range(4):
             by = joints[held[:, joint], :3]
@@ -290,7 +292,7 @@ def _primitive(file: _File, primitive: dict[str, Any], weights: list[float]) -> 
         if weight and "POSITION" in target:
             vertices += weight * file.values(target["POSITION"], "VEC3", len(vertices))
     if "indices" in primitive:
-        corners = file.values(primitive["indices"], "SCALAR").astype(np.int64)
+        corners = file.values(primitive["indices"], "SCALAR").astype(_INDEX).astype(np.int64)
     else:
         corners = np.arange(len(vertices), dtype=np.int64)
     mode = primitive.get("mode", _TRIANGLES)

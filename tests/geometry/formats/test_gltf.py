@@ -230,6 +230,27 @@ def with_one_bind() -> Gltf:
     return scene
 
 
+def with_negative(kind: str) -> Gltf:
+    """A scene whose corners, joints or sparse places are bytes with a sign, and one of them is -1."""
+    scene = {"corners": box_scene(), "joints": skinned([1, 0]), "places": sparse(is_new=False)}[kind]
+    primitive = scene.tree["meshes"][0]["primitives"][0]
+    if kind == "corners":
+        primitive["indices"] = scene.accessor([0, 1, -1, *np.ravel(BOX_TRIANGLES)], "SCALAR", "int8")
+    elif kind == "joints":
+        primitive["attributes"]["JOINTS_0"] = scene.accessor([[-1, 0, 0, 0]] * 8, "VEC4", "int8")
+    else:
+        places = scene.tree["accessors"][-1]["sparse"]["indices"]
+        places.update(bufferView=scene.accessor([-1, 3], "SCALAR", "int8"), componentType=5120)
+    return scene
+
+
+def with_mode(mode: int) -> Gltf:
+    scene = box_scene()
+    primitives = scene.tree["meshes"][0]["primitives"]
+    primitives.append({**primitives[0], "mode": mode})
+    return scene
+
+
 # Documents that contradict themselves, and what is said of them.
 WRONG: dict[str, tuple[Gltf, str]] = {
     "a joint outside of the scene": (
@@ -267,6 +288,11 @@ WRONG: dict[str, tuple[Gltf, str]] = {
         changed(sparse(is_new=True), lambda tree: tree["accessors"][-1].update(count=10**9)),
         "has no data",
     ),
+    **{
+        f"{kind} that count from the end": (with_negative(kind), r"outside 0\.\.7|do not fit together")
+        for kind in ("corners", "joints", "places")
+    },
+    "a mode below that of points": (with_mode(-1), "no whole triangles of the mode -1"),
     "fewer matrices than joints": (with_one_bind(), "2 joints and 1 matrices"),
 }
 
