@@ -109,6 +109,8 @@ def read_unpacked(path: Path, factor: float, read: Read = BufferedReader.read) -
             data = read(file, length)
         if packed:
             data = _unpacked_bounded(data, factor)
+    except gzip.BadGzipFile as error:
+        raise MeshError(f"its packed data are damaged, or other bytes follow them: {error}; pack it again") from error
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     data = data.removeprefix(codecs.BOM_UTF8)

@@ -160,7 +160,8 @@ def _parsed_header(data: bytes) -> tuple[dict[str, _Element], int, bool]:
     elements: dict[str, _Element] = {}
     order = ""
     # Some programs write X for x.
-    for line in re.sub(rb"\s[XYZ]\s", lambda axis: axis[0].lower(), header[2]).decode("ascii", "replace").splitlines():
+    for row in re.sub(rb"\s[XYZ]\s", lambda axis: axis[0].lower(), header[2]).splitlines():
+        line = row.decode("ascii", "replace")
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 continue

@@ -169,6 +169,7 @@ CASES: dict[str, Case] = {
             "a last line that ends unlike the first": replaced(PLY_LITTLE, (b"ply\n", b"ply\r\n")),
             "a first line that ends unlike the last": replaced(PLY_LITTLE, (b"end_header\n", b"end_header\r\n")),
             "mixed line ends": replaced(PLY_BOX, (b"float x\n", b"float x\r\n"), (b"float y\n", b"float y\r")),
+            "control characters in a comment": replaced(PLY_BOX, (b"element vertex 77", b"a\x0bb\x0cc\x1cd")),
             "X for x": re.sub(rb"(float) (.)\n", lambda found: found[0].upper().replace(b"FLOAT", b"float"), PLY_BOX),
             "lengths in single precision": replaced(PLY_BOX, (b"list uchar", b"list float")),
             "references of 64 bits": replaced(
@@ -280,6 +281,8 @@ CASES |= {
 }
 CASES |= {
     "gz, unpacked already": (".ply.gz", PLY_BOX, BOX_AREA),
+    "gz, in two parts": (".ply.gz", gzip.compress(PLY_BOX[:99]) + gzip.compress(PLY_BOX[99:]) + bytes(9), BOX_AREA),
+    "gz, other bytes behind": (".ply.gz", gzip.compress(PLY_BOX) + b"more", "packed data .*other bytes follow them"),
     "gz, web page": (".ply.gz", b"<!DOCTYPE HTML><html>404</html>", "or a web page"),
     "gz, pointer": (".gii.gz", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n", "git lfs pull"),
 }
