@@ -72,13 +72,15 @@ _GMSH = "pip install gmsh; gmsh scan{0} -2 -o scan.stl"
 _RESAVED = "pip install gmsh; gmsh scan{0} -save -format msh41 -o surface.msh"
 _ASSIMP = "assimp export scan{0} scan.ply"
 _MESHIO = "pip install meshio h5py; meshio convert scan{0} scan.vtu"
+# Meshio takes the nodes of all parts for those of one, and leaves out where an assembly places them.
+_FLAT = f"{_MESHIO}  # where it has parts, first write it without, by noPartsInputFile=ON"
 CONVERTED = {
     suffix: (name, command.format(suffix))
     for name, suffixes, command in (
         ("COLLADA", ".dae", _PYTHON.format("trimesh scipy pycollada", _TRIMESH)),
         *(("VRML", ".wrl", _MESHLAB), ("X3D", ".x3d", _MESHLAB), ("3D Studio", ".3ds", _MESHLAB)),
         *(("OpenCTM", ".ctm", _MESHLAB), ("STEP", ".step .stp", _GMSH), ("IGES", ".iges .igs", _GMSH)),
-        *(("BREP", ".brep", _GMSH), ("Abaqus", ".inp", _MESHIO), ("Nastran", ".bdf .nas", _MESHIO)),
+        *(("BREP", ".brep", _GMSH), ("Abaqus", ".inp", _FLAT), ("Nastran", ".bdf .nas", _MESHIO)),
         *(("XDMF", ".xdmf", _MESHIO), ("Medit in binary", ".meshb", _MESHIO), ("I-deas", ".unv", _RESAVED)),
         *(("MED", ".med", _RESAVED), ("CGNS", ".cgns", _RESAVED), ("FBX", ".fbx", _ASSIMP)),
         *(("LightWave", ".lwo", _ASSIMP), ("Draco", ".drc", "draco_decoder -i scan{0} -o scan.ply")),

@@ -478,7 +478,7 @@ CASES |= {
     "freesurfer's text": (".lh.pial.asc", b"#!ascii version of lh.pial\n3 1\n", "mris_convert lh.asc lh.gii"),
     "collada": (".dae", b"<COLLADA/>", r"format COLLADA.*trimesh\.load\('scan\.dae'\)"),
     "vrml": (".wrl", b"#VRML", r"format VRML.*load_new_mesh\('scan\.wrl'\)"),
-    "abaqus": (".inp", b"*Heading", "format Abaqus.*meshio convert scan.inp scan.vtu"),
+    "abaqus": (".inp", b"*Heading", "format Abaqus.*meshio convert scan.inp scan.vtu  # .* noPartsInputFile=ON"),
     "nastran": ("lh.bdf", b"BEGIN BULK", "format Nastran.*meshio convert scan.bdf scan.vtu"),
     "step": (".STEP", b"ISO-10303-21;", "format STEP.*gmsh scan.step -2 -o scan.stl"),
     "medit in binary": (".meshb", b"\1\0\0\0", "Medit in binary.*meshio convert scan.meshb scan.vtu"),
