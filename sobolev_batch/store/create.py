@@ -137,7 +137,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     with suppress(StoreError, ValueError, TypeError, KeyError):
         stored = store.labels()
     last, last_page = (max(store.stored_chunks(name), default=-1) for name in (layout.RECORD, layout.PAGE))
-    count = max(1 + last, ROWS_PER_PAGE * (1 + last_page))
+    count = max(len(stored), 1 + last, ROWS_PER_PAGE * (1 + last_page))
     fresh = Store(store.location)
     fresh.documents = documents_in(record_keys(count))
     records, damaged = Records(fresh).examine()

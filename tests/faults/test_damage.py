@@ -294,6 +294,13 @@ def test_metadata_of_one_node(name: str, store: Path, mended: Callable[..., None
     mended()
 
 
+def test_metadata_where_the_last_meshes_have_no_record_yet(store: Path, mended: Callable[..., None]) -> None:
+    for row in (3, 4):
+        delete(store / RECORD.format(row=row))
+    delete(store / "fourier/xi_x/zarr.json")
+    mended(*LABELS[3:])
+
+
 ROOT = "consolidated_metadata", "metadata"
 
 
