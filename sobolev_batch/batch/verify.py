@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -123,9 +124,11 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
         own = replace(location, fence=lock.of_holder(root).fence)
         objects = objects and Objects.read(own, is_thorough=True)
         found = _verify_all(own, objects, notify, may_write=True)
-        if root != location and not found.is_sound and (above := Objects.read(replace(own, name=root.name))):
-            # Runs pass over objects whose records there say that nothing is missing.
-            above.records.write(above.rows[location.name.rpartition("/")[2]], None)
+        # A damaged root loses all records when a run makes it again.
+        with suppress(DamageError):
+            if root != location and not found.is_sound and (above := Objects.read(replace(own, name=root.name))):
+                # Runs pass over objects whose records there say that nothing is missing.
+                above.records.write(above.rows[location.name.rpartition("/")[2]], None)
         return found
     finally:
         release(root, lock)

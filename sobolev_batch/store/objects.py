@@ -190,10 +190,10 @@ def stores_below(location: Location) -> dict[str, Location]:
 def root_of(location: Location) -> Location:
     """Return the root of the store that a location lies in, where the lock is: an object's lies above its own."""
     name = location.name.rpartition("/")[2]
+    # Damage of its tables changes nothing of that.
     with suppress(StoreError):
         above = location.beside("")
-        objects = Objects.read(above)
-        if objects is not None and name in objects.rows:
+        if name in Store(above).attributes(of_objects=True)["study"][OBJECTS]:
             return above
     return location
 

@@ -312,6 +312,16 @@ def test_one_lock_keeps_all_objects(changeable: Path) -> None:
     assert sb.verify(changeable / "b").is_sound
 
 
+def test_one_lock_keeps_all_objects_where_their_tables_are_damaged(changeable: Path) -> None:
+    flip(changeable / "convergence/relative/c/0/0")
+    with locked(Location.parse(changeable), Lock.of_this_process()):
+        for use in (sb.verify, sb.unlock):
+            with pytest.raises(sb.errors.LockError):
+                use(changeable / "b")
+    flip(changeable / "b/convergence/relative/c/0/0")
+    assert not sb.verify(changeable / "b").is_sound
+
+
 def test_the_status_is_that_of_the_run(changeable: Path) -> None:
     store = Store(changeable)
     ended = RunRecord.read(store)
