@@ -91,7 +91,7 @@ class MeshCache:
         if key in self.asked:
             return self.asked[key]
         if key not in self.assumed:
-            if not (known := (self.folder.read(key) or b"").decode()):
+            if not (known := (self.folder.read(key) or b"").decode(errors="replace")):
                 return self._ask(key, words) if self.may_run else None
             self.assumed[key] = words, known
         return self.assumed[key][1]
