@@ -23,7 +23,6 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import Objects, for_each_object, labelled
 from sobolev_batch.store.records import Record
 from sobolev_batch.store.workspace import Workspace
-from sobolev_batch.study.comparable import comparison_warnings
 from sobolev_batch.study.pilots import Look
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.study.schema import REFERENCE_LABEL
@@ -164,7 +163,7 @@ class StudyPlan(Shown):
             Hausdorff and Chamfer distances, and distances of very many pairs.
         processor_seconds: Processor time that a run will take, that of starting processes included.
         time: What is shown of both, line by line.
-        warnings: What would make a run useless, see `comparison_warnings`, or end it: no folder for its store.
+        warnings: What would end a run: no folder for its store.
 
     >>> import sobolev_batch as sb
     >>> plan = sb.plan("workflows/icosphere.toml")
@@ -343,7 +342,7 @@ def plan(
         few = f"{len(refused):,} of {len(plans) + len(refused):,} objects cannot be planned, for the reasons below"
         time = (*(time if plans else ()), few)
     lacking = "" if store is None else location.lacks_folder()
-    warnings, count = (*comparison_warnings(study), *filter(None, [lacking])), len(study.objects)
+    warnings, count = tuple(filter(None, [lacking])), len(study.objects)
     return StudyPlan(
         study.name, str(location), count, weight, plans, refused, seconds, processor_seconds, time, warnings
     )

@@ -43,7 +43,7 @@ class TaskSizes(NamedTuple):
 
 def is_predictable(row: Row) -> bool:
     """Tell whether the size of a surface is known before it is made: nobody knows how long a program takes."""
-    return math.isfinite(row.member.expected_size().factor)
+    return row.member.expected_size().is_known
 
 
 def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, TaskSizes], dict[str, str]]:

@@ -1,6 +1,5 @@
-"""What `plan`, `run` and `submit` settle first: the place of the store, permissions, and what to warn of."""
+"""What `plan`, `run` and `submit` settle first: the place of the store, and permissions."""
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +9,7 @@ from sobolev_batch.parameters import as_names, check_flags
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import known_names, quoted
 from sobolev_batch.store.location import Location
-from sobolev_batch.study.comparable import comparison_warnings
 from sobolev_batch.study.study import Study, StudyLike, as_study
-
-_log = logging.getLogger(__name__)
 
 # A store as functions take it, None for the default place.
 StoreLike = str | Path | Location | None
@@ -37,7 +33,7 @@ def settled(study: StudyLike, store: StoreLike, *, may_run: bool, may_search: bo
 def ready_to_run(
     study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
 ) -> tuple[Study, Location]:
-    """Return a study that may run, or a part of it, and its place; log what would make the run useless."""
+    """Return a study that may run, or a part of it, and its place."""
     check_flags(allow_commands=allow_commands)
     part = replace(as_study(study), only=tuple(as_names(only)))
     study, location = settled(part, store, may_run=True, may_search=True)
@@ -48,8 +44,6 @@ def ready_to_run(
             _DEFAULT_FOLDER.mkdir(exist_ok=True)
     if problem := location.lacks_folder():
         raise StoreError(problem)
-    for text in comparison_warnings(study):
-        _log.warning("%s", text)
     return study, location
 
 

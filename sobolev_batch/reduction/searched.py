@@ -1,6 +1,5 @@
 """Families of meshes as coarse as tolerances permit: each member is a search, which its task carries out."""
 
-import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -146,4 +145,4 @@ class SearchedMember(Member):
     def expected_size(self) -> ExpectedSize:
         """Return the size of the original, since nothing is known of the result, and the memory of a trial."""
         size = self.search.original.expected_size()
-        return replace(size, projected_bytes=self.search.projected_bytes(size.triangles), factor=math.inf)
+        return replace(size, projected_bytes=self.search.projected_bytes(size.triangles), is_known=False)

@@ -6,7 +6,6 @@ come from somebody else.
 
 import hashlib
 import inspect
-import math
 import re
 import shlex
 import time
@@ -272,7 +271,7 @@ class RemeshedMember(Member):
 
     def expected_size(self) -> ExpectedSize:
         """Return the size of the original, since nothing is known of the result."""
-        return replace(self.original.expected_size(), factor=math.inf)
+        return replace(self.original.expected_size(), is_known=False)
 
 
 def call_function(mesh: Mesh, function: Callable[..., Any] | str, parameters: Mapping[str, Parameter]) -> Made:

@@ -40,8 +40,6 @@ from sobolev_batch.sources.registry import ExpectedSize, Fingerprint, Member, So
 MOST_MESHES = 100_000
 _LONGEST_TEXT = 1000
 _LARGEST_FILE_BYTES = 64 << 20
-# By how much the length of a file may mislead about its triangles: it may have normals, colours or few digits.
-_LENGTH_FACTOR = 4.0
 # What the file system says of a file.
 _State = tuple[str | int, ...]
 # Digests of the last files that were read; a file that was changed within this time may be changed again without a
@@ -222,8 +220,7 @@ class FileMember(Member):
 
     def expected_size(self) -> ExpectedSize:
         """Return the size that the header announces, or that the length of the file suggests."""
-        factor = 1.0 if mesh_format(self.path) == ".ply" else _LENGTH_FACTOR
-        return ExpectedSize(*expected_size(self.path), factor=factor)
+        return ExpectedSize(*expected_size(self.path))
 
 
 def _listed_members(meshes: str | tuple[MeshTable, ...], folder: Path) -> tuple[Member, ...]:

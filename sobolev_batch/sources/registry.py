@@ -139,7 +139,7 @@ class ExpectedSize:
         triangles: Approximate number of triangles; 0 for a closed form.
         projected_bytes: Approximate peak of the memory that `Member.load` takes.
         seconds: Approximate processor time that `Member.load` takes, where it does more than read or tile.
-        factor: Factor by which the number of triangles may be wrong, either way; infinite where nothing is known of it.
+        is_known: False where nothing is known of the triangles before the surface is made.
 
     >>> import sobolev_batch as sb
     >>> sb.sources.ExpectedSize(triangles=20_480, projected_bytes=3e6).triangles
@@ -149,7 +149,7 @@ class ExpectedSize:
     triangles: int = 0
     projected_bytes: float = 0.0
     seconds: float = 0.0
-    factor: float = 1.0
+    is_known: bool = True
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ class MadeMember(Member):
         size = ExpectedSize(self.triangles or 0) if first is None else first.expected_size()
         size = replace(size, projected_bytes=max(size.projected_bytes, float(self.triangle_bytes * size.triangles)))
         if self.triangles is not None:
-            size = replace(size, triangles=self.triangles, factor=1.0)
+            size = replace(size, triangles=self.triangles, is_known=True)
         return replace(size, seconds=size.seconds + self.triangle_seconds * size.triangles)
 
 

@@ -10,20 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tomli_w
 from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.dry_run import seconds_of_missing
 from sobolev_batch.batch.field_costs import row_seconds
-from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.store.layout import Store, hide_tables
 from sobolev_batch.store.records import Record, Records
-from sobolev_batch.study.comparable import comparison_warnings
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.transform.fourier import TransformSettings, expected_points, field_seconds, transform_block
-from tests.support.commands import call
 from tests.support.studies import balls, methods_of, small_table
 
 
@@ -181,54 +177,11 @@ def made_of(**families: Mapping[str, Any] | list[int]) -> list[dict[str, Any]]:
     ]
 
 
-def files(*names: str) -> dict[str, Any]:
-    return {"source": "files", "paths": [*names]}
-
-
 COMMAND = {
     "source": "command",
     "mesh": {"source": "icosphere", "levels": [0]},
     "command": ["cp", "{input}", "{output}"],
 }
-SIX, FIVE = (balls(**{f"ball{i}": 1.0 for i in range(count)}) for count in (6, 5))
-APART = "no common range of sizes: fine begins at 1,280, coarse ends at 80; methods cannot be ranked at equal triangles"
-FEW = "the test of a league cannot tell 2 methods from chance with"
-
-
-@pytest.mark.parametrize(
-    ("table", "expected"),
-    [
-        (small_table(), []),
-        (small_table(family=made_of(coarse=[0, 1], fine=[1, 2])), []),
-        # 80 and 320 triangles, and the rest.
-        (small_table(family=made_of(coarse=[0, 1], fine=[3, 4])), [APART]),
-        (
-            small_table(object=SIX, family=made_of(coarse=[1], fine=[3])),
-            [f"{APART} for 6 of 6 objects, such as ball0", FEW],
-        ),
-        # Not meant for a comparison by size, or not known.
-        (small_table(family=made_of(coarse=[1], fine=[3])), []),
-        (small_table(object=SIX, family=made_of(coarse=COMMAND, fine=[3])), []),
-        (small_table(object=SIX, family=made_of(coarse=files("80.ply"), fine=[3])), [APART, FEW]),
-        # The length of a file only suggests how many triangles it has.
-        (small_table(object=SIX, family=made_of(coarse=files("80.off"), fine=[2])), []),
-        (small_table(object=SIX, family=made_of(coarse=files("80.off"), fine=[5])), ["no common range", FEW]),
-        (small_table(object=SIX, family=methods_of()), []),
-        (small_table(object=FIVE, family=methods_of()), [f"{FEW} 5 objects; take 6 objects or more"]),
-        (small_table(object=FIVE, family=made_of(coarse=[1, 2])), []),
-    ],
-)
-def test_what_would_make_a_run_useless_is_told_before_it(
-    table: dict[str, Any], expected: list[str], tmp_path: Path
-) -> None:
-    for suffix in ("ply", "off"):
-        write_mesh(sb.shapes.icosphere(1), tmp_path / f"80.{suffix}")
-    made = sb.Study.from_table(table, folder=tmp_path)
-    found = tuple(comparison_warnings(made))
-    assert len(found) == len(expected)
-    for line, beginning in zip(found, expected, strict=True):
-        assert line.startswith(beginning)
-        assert "\n" not in line
 
 
 def test_a_plan_says_what_nobody_can_predict(tmp_path: Path) -> None:
@@ -272,15 +225,3 @@ def test_a_plan_fits_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert {len(line) > 60 for line in lines if "x" * 60 not in line} == {False}
     assert f" study: {title} " in " ".join(str(found).split())
     assert lines[1].startswith(" " * 15)
-
-
-def test_warnings_come_first_in_commands_and_in_python(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "study.toml"
-    path.write_text(tomli_w.dumps(small_table(object=balls(a=1.0), family=methods_of())))
-    plan, run = (call(word, path, "--store", f"memory://warnings-{word}") for word in ("plan", "run"))
-    (warning,) = sb.plan(path, "memory://warnings-python").warnings
-    assert warning.startswith(f"{FEW} 1 object; ")
-    assert f"warning: {warning} " in f"{' '.join(plan.stdout.split())} "
-    assert run.stderr.startswith(f"warning: {warning}\n")
-    sb.run(path, "memory://warnings-python")
-    assert caplog.messages[0] == warning

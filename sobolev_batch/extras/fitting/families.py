@@ -156,5 +156,5 @@ class FittedMember(Member):
             count,
             max(start.projected_bytes, target.projected_bytes, own_bytes),
             start.seconds + target.seconds + step_seconds * self.settings.steps,
-            start.factor if self.triangles is None else 1.0,
+            start.is_known or self.triangles is not None,
         )

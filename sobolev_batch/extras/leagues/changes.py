@@ -9,11 +9,18 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.leagues.league import ENDS, RELATIVE, chosen_methods, interval_text, orders_of
-from sobolev_batch.extras.leagues.statistics import adjusted, errors_of_logarithms, interval, numbers_of, sign_flip_test
+from sobolev_batch.extras.leagues.statistics import (
+    SIGNIFICANCE,
+    adjusted,
+    errors_of_logarithms,
+    interval,
+    least_objects,
+    numbers_of,
+    sign_flip_test,
+)
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.study.comparable import SIGNIFICANCE, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import AnyStores, as_tree, finished_group, reference_of, root_attribute, stores_of

@@ -16,12 +16,15 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of, objects_text
 from sobolev_batch.extras.leagues.statistics import (
+    SIGNIFICANCE,
     Curve,
     adjusted,
     common_sizes,
     errors_of_logarithms,
     filled,
+    gap_of,
     interval,
+    least_objects,
     numbers_of,
     sign_flip_test,
     within_objects,
@@ -31,7 +34,6 @@ from sobolev_batch.norms.columns import NUMBER, VARIABLES
 from sobolev_batch.parameters import as_names, check_choice
 from sobolev_batch.shown import shown_tables
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of, tables_of
 from sobolev_batch.tables.open import AnyStores, as_tree, objects_of, root_attribute, source_of

@@ -1,7 +1,7 @@
 """Curves of methods at equal sizes, their intervals, and tests whether two methods differ."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -12,10 +12,13 @@ from scipy.special import stdtrit
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.study.comparable import Range, common_range
 
 # Sizes at which curves are compared, evenly spaced on a logarithmic axis.
 _SIZES = 5
+# Methods whose ranges of sizes miss each other by less than this are compared between their ends.
+_LARGEST_GAP = 1.2
+# A p-value below it counts as a difference.
+SIGNIFICANCE = 0.05
 # Meshes whose sizes differ by a smaller factor tell no rate.
 _SMALLEST_RANGE = 1.1
 CONFIDENCE = 0.95
@@ -26,6 +29,10 @@ _NEITHER = ("order", "level", "rank", "rate", "rate_error")
 # All changes of sign are tried for as many objects, and as many random ones for more.
 _MOST_ENUMERATED, _DRAWS, _SEED = 14, 20_000, 0
 _MOST_SIGNS = 1 << 22
+
+
+# Ends of a range of logarithms of sizes.
+Range = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +118,34 @@ def filled(values: Reals) -> Reals:
     of_methods = np.linalg.lstsq(matrix, (own - known * means).sum(axis=0))[0]
     of_objects = (shares * (own - of_methods)).sum(axis=1, keepdims=True)
     return np.where(known, values, of_objects + of_methods)
+
+
+def common_range(ranges: Iterable[Range]) -> Range | None:
+    """Return the range that all have in common, or twice the middle between their ends where these nearly meet."""
+    begins, ends = zip(*ranges, strict=True)
+    low, high = max(begins), min(ends)
+    if low <= high:
+        return low, high
+    middle = (low + high) / 2
+    return (middle, middle) if low - high <= math.log(_LARGEST_GAP) else None
+
+
+def gap_of(ranges: Mapping[str, Range]) -> str:
+    """Return which methods have no range of sizes in common."""
+    first = max(ranges, key=lambda method: ranges[method][0])
+    last = min(ranges, key=lambda method: ranges[method][1])
+    begin, end = math.exp(ranges[first][0]), math.exp(ranges[last][1])
+    return f"no common range of sizes: {first} begins at {begin:,.5g}, {last} ends at {end:,.5g}"
+
+
+def least_objects(tests: int) -> int:
+    """Return with how many objects the most extreme of all changes of sign is rare enough, among several tests.
+
+    >>> least_objects(1), least_objects(6)
+    (6, 8)
+    """
+    # Of 2^n changes of sign two are as extreme.
+    return math.floor(math.log2(2 * tests / SIGNIFICANCE)) + 1
 
 
 def common_sizes(curves: Sequence[Curve]) -> Reals | None:
