@@ -12,14 +12,12 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 import psutil
 
 from sobolev_batch.errors import InputError, MeshError, StudyError, one_line
-from sobolev_batch.geometry.formats.by_name import WRITERS, is_mesh_name
-from sobolev_batch.geometry.formats.conversion import as_mesh
 from sobolev_batch.geometry.formats.readers import read_mesh
 from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.geometry.mesh import Mesh
@@ -124,7 +122,7 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
             raise CannotStartError(problem) from error
         files = {name: folder / f"{name}{suffix}" for name, suffix in zip((INPUT, OUTPUT), suffixes, strict=True)}
         try:
-            _write(mesh, files[INPUT])
+            write_mesh(mesh, files[INPUT])
         except InputError as error:
             raise CannotStartError(f"its input cannot be written: {error}") from error
         filled = [PLACEHOLDER.sub(lambda found: str(files.get(found[1], found[0])), word) for word in words]
@@ -159,7 +157,7 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
             problem = f"{words[0]} wrote no mesh (output{suffixes[1]})"
         if not problem:
             try:
-                return cost, _read(files[OUTPUT])
+                return cost, read_mesh(files[OUTPUT])
             except InputError as error:
                 problem = f"{words[0]} wrote what cannot be used: {str(error).removeprefix(f'{files[OUTPUT]}: ')}"
         return cost, ": ".join(filter(None, (problem, _tail(err, out))))
@@ -221,34 +219,3 @@ def _tail(*files: IO[bytes]) -> str:
         if text := " ".join(file.read(4 * _LONGEST_TAIL).decode(errors="replace").split()):
             return text if len(text) <= _LONGEST_TAIL else f"... {text[-_LONGEST_TAIL:]}"
     return ""
-
-
-def _write(mesh: Mesh, path: Path) -> None:
-    if path.suffix in WRITERS:
-        write_mesh(mesh, path)
-        return
-    meshio = _meshio(path)
-    meshio.write(path, meshio.Mesh(mesh.vertices, [("triangle", mesh.triangles)]))
-
-
-def _read(path: Path) -> Mesh:
-    if is_mesh_name(path):
-        return read_mesh(path)
-    meshio = _meshio(path)
-    try:
-        return as_mesh(meshio.read(path))
-    except InputError:
-        raise
-    # On damaged input its readers raise anything.
-    except (Exception, SystemExit) as error:
-        raise MeshError(f"{path}: {one_line(error)}") from error
-
-
-def _meshio(path: Path) -> Any:
-    try:
-        import meshio
-    except ImportError as error:
-        raise MeshError(f"the format {path.suffix} needs the library meshio: pip install meshio") from error
-    if path.suffix not in meshio.extension_to_filetypes:
-        raise MeshError(f"neither this package nor meshio knows the format {path.suffix}")
-    return meshio

@@ -1,4 +1,4 @@
-"""Formats that are read rarely, and only read.
+"""Formats that are read rarely.
 
 In: glTF, GIFTI, FreeSurfer, VTK, 3MF, Medit and Gmsh files. Out: vertices and triangles.
 """

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Sequence
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from sobolev_batch.extras.formats.shared import SURFACE, beside_volume
 from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import Raw, reals, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
+from sobolev_batch.geometry.mesh import Mesh
 
 # Medit's cells with volume, and words of sections that have no part in a surface.
 _MEDIT_VOLUMES = ("Tetrahedra", "Prisms", "Pyramids", "Hexahedra")
@@ -60,6 +62,17 @@ def parse_medit(data: bytes) -> Raw:
     )
     volumes = sum(int(_numbers(sections[name], name)[0]) for name in _MEDIT_VOLUMES if name in sections)
     return _surface(vertices, [corners - 1 for corners in faces], volumes, ".mesh")
+
+
+def write_medit(mesh: Mesh) -> bytes:
+    """Return a Medit mesh in text, all digits kept."""
+    file = BytesIO()
+    file.write(f"MeshVersionFormatted 2\nDimension 3\nVertices {len(mesh.vertices)}\n".encode())
+    np.savetxt(file, mesh.vertices, fmt="%.17g %.17g %.17g 0")
+    file.write(f"Triangles {len(mesh.triangles)}\n".encode())
+    np.savetxt(file, mesh.triangles + 1, fmt="%d %d %d 0")
+    file.write(b"End\n")
+    return file.getvalue()
 
 
 def parse_gmsh(data: bytes) -> Raw:
@@ -236,4 +249,4 @@ def _surface(vertices: Reals, faces: Sequence[NDArray[Any]], volumes: int, suffi
     return raw._replace(notes=(*raw.notes, *beside_volume(volumes, len(sizes))))
 
 
-FORMATS = (Format((".mesh",), parse_medit, 40, 360), Format((".msh",), parse_gmsh, 48, 460))
+FORMATS = (Format((".mesh",), parse_medit, 40, 360, write_medit), Format((".msh",), parse_gmsh, 48, 460))

@@ -13,7 +13,7 @@ _WHAT = "the mesh"
 
 
 def write_mesh(mesh: MeshLike, path: str | Path) -> None:
-    """Write a mesh to a file in the format of its suffix: .ply, .obj, .stl or .off.
+    """Write a mesh to a file in the format of its suffix: .ply, .obj, .stl, .off or .mesh.
 
     Coordinates keep all digits, except in STL, which has single precision and no shared vertices.
 
