@@ -157,7 +157,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "spectrum": {"a": A, "b": B, "order": -4.0, "bands": 3, "lattice": LATTICE, "similarity": None},
     "status": {"store": ONE},
     "submit": {"study": "", "store": ONE, "client": None, "allow_commands": False, "only": ()},
-    "table": {"store": OPEN, "order": -3.0, "x": "edge_length"},
+    "table": {"store": OPEN, "order": -3.0},
     "testing.assert_same_surface": {**_OF_VERDICTS, "witness": None},
     "testing.assert_within": {"a": A, "b": B, "length": 1.0, "unit": None, "one_way": False},
     "testing.same_surface": _OF_VERDICTS,

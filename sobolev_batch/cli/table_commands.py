@@ -43,20 +43,14 @@ def table_command() -> None:
 
 @table_command.command(_DEFAULT)
 @table_options
-@click.option(
-    "--x",
-    default="edge_length",
-    show_default=True,
-    help="Observe rates in edge_length, triangles, vertices, seconds, or a number among the metadata of the meshes.",
-)
-def convergence_command(store: Location, style: Format, orders: ChosenOrders, x: str) -> None:
+def convergence_command(store: Location, style: Format, orders: ChosenOrders) -> None:
     """Print distances to the reference, with rates.
 
     The rows of several objects follow each other.
     """
     from sobolev_batch.tables.convergence import format_table
 
-    echo_lines(format_table(store, style, orders, x=x), style)
+    echo_lines(format_table(store, style, orders), style)
 
 
 @table_command.command("matrix")

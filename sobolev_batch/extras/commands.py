@@ -253,8 +253,8 @@ def plot_command(
     from the study, by default a few, chosen by their distances. Pictures need the extra "plot".
     """
     from sobolev_batch.extras.leagues.league import league
+    from sobolev_batch.extras.leagues.statistics import EDGE_LENGTH
     from sobolev_batch.store.objects import Objects
-    from sobolev_batch.tables.convergence import EDGE_LENGTH
 
     with from_extra("plot", "a plot needs"):
         from sobolev_batch.extras.figures.drawing import COST_LEAGUE, LEAGUE, write_plots

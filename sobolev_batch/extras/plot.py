@@ -14,8 +14,8 @@ import xarray as xr
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.league import League
+from sobolev_batch.extras.leagues.statistics import EDGE_LENGTH
 from sobolev_batch.geometry.surface import is_finite_number
-from sobolev_batch.tables.convergence import EDGE_LENGTH
 from sobolev_batch.tables.open import AnyStore, as_tree, finished_group
 
 with from_extra("plot", "a plot needs"):

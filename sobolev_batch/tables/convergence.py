@@ -7,14 +7,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS
-from sobolev_batch.parameters import as_names
 from sobolev_batch.shown import few_of
-from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import (
@@ -33,21 +30,9 @@ from sobolev_batch.tables.open import (
 )
 from sobolev_batch.tables.other_orders import convergence_at, order_note
 from sobolev_batch.tables.rendering import Column, Section, machine_table, rendered
-from sobolev_batch.tables.results import rates_in_families
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
 
-EDGE_LENGTH = "edge_length"
-# Columns of a table that are sizes: the finer a mesh is, the smaller is the first, and the larger are the others.
-_LABELS = {
-    EDGE_LENGTH: "mean edge length in {unit}",
-    "triangles": "number of triangles",
-    "vertices": "number of vertices",
-    "seconds": "computing time of the mesh in seconds",
-    "make_seconds": "time of making the mesh in seconds",
-    "make_cpu_seconds": "processor time of making the mesh in seconds",
-    "make_peak_bytes": "memory of making the mesh in bytes",
-}
 ALONE = "The study has its reference alone: there is nothing to compare."
 # What a remesher may break.
 CONNECTION_COLUMNS = (
@@ -116,15 +101,13 @@ _METRIC_COLUMNS = (
 )
 
 
-def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH) -> pd.DataFrame:
+def table(store: AnyStore, order: Orders | None = None) -> pd.DataFrame:
     """Return the convergence table of a store in long form: one row for each mesh and order.
 
     Args:
         store: Path, URL or opened DataTree of the store. Rows of several objects begin with a column object.
         order: One order s < -1/2, or several; default all of the store. Others than those are computed from the stored
             fields, which takes about as long as reading them.
-        x: Size of a mesh, a column of the table, in which rates are observed: "edge_length", "triangles", "vertices"
-            or "seconds" (spent on its Fourier field), or one of the metadata that the study gives its meshes.
 
     Returns:
         One row for each mesh and order. Lengths of a mesh are in the study's unit. The columns:
@@ -139,8 +122,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
           relative and relative_error (over the norm of the reference);
         - area_part and shape_part: what a change of total area alone explains of the distance, and the rest. Their
           squares add up to its square. area_part_error and shape_part_error are their errors;
-        - rate, the observed order of convergence, and rate_error: distance ~ edge_length^rate, or distance ~ x^-rate
-          for another x, since the others grow;
+        - rate, the observed order of convergence, and rate_error: distance ~ edge_length^rate;
         - resolved (the distance exceeds its error) and within (the error is as small as the study requests);
         - where the study requests [proximity]: the numbers of its metrics, by their names in `proximity`, and volume,
           smallest_angle and aspect_ratio; their lengths are in the unit of the files.
@@ -150,7 +132,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         of several objects have what these share, and as ``left_out`` the names of objects without tables.
 
     Raises:
-        InputError: The store has no tables yet, or its meshes have no such size.
+        InputError: The store has no tables yet.
         OrderError: An order is not below -1/2.
         DamageError: An order is to be computed, and a field is not what was stored.
         StoreError: The location has no store of a study.
@@ -164,35 +146,34 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     >>> frame[["components", "euler_characteristic"]].value_counts().to_dict()
     {(1, 2): 4}
     """
-    frames = tables_of(store, order, x=x)
+    frames = tables_of(store, order)
     return joined(frames, left_out(store, frames))
 
 
-def tables_of(store: AnyStores, order: Orders | None = None, *, x: str = EDGE_LENGTH) -> dict[str, pd.DataFrame]:
+def tables_of(store: AnyStores, order: Orders | None = None) -> dict[str, pd.DataFrame]:
     """Return the rows of `table` of each object that has any, by its name, "" for an only one; InputError if none has.
 
     The root of a store has the rows of all objects at the orders of the study; others come from the stores of objects.
     """
-    (x,) = as_names([x])
     if not isinstance(store, Mapping) or isinstance(store, xr.DataTree):
         tree = as_tree(store)
         if not has_objects(tree):
-            return {"": _table(tree, order, x)}
+            return {"": _table(tree, order)}
         if "convergence" in tree.children:
             stored = finished_group(tree, "convergence", load=False)["order"].values
             if order is None or np.isin(order, stored).all():
-                return _divided(_rows(tree, order), x)
+                return _divided(_rows(tree, order))
     trees = {name: as_tree(place) for name, place in stores_of(store).items()}
     if not (finished := {name: tree for name, tree in trees.items() if "convergence" in tree.children}):
         raise InputError("there are no tables yet: run the study to its end")
-    return {name: _table(tree, order, x) for name, tree in finished.items()}
+    return {name: _table(tree, order) for name, tree in finished.items()}
 
 
-def _table(tree: xr.DataTree, order: Orders | None, x: str) -> pd.DataFrame:
+def _table(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
     frame = _rows(tree, order)
     frame.attrs["reference"] = reference_of(tree)
     frame.attrs["unit_length"] = unit_of(tree)[1]
-    return frame if x == EDGE_LENGTH else _with_rates(frame, x)
+    return frame
 
 
 def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
@@ -230,7 +211,7 @@ def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
     return frame
 
 
-def _divided(rows: pd.DataFrame, x: str) -> dict[str, pd.DataFrame]:
+def _divided(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return the rows of each object by its name, without what others alone have."""
     frames, known = {}, rows.attrs.get("metadata", ())
     objects, references, unit_lengths = (rows[key].tolist() for key in _OF_ALL)
@@ -246,7 +227,7 @@ def _divided(rows: pd.DataFrame, x: str) -> dict[str, pd.DataFrame]:
         frame.attrs = {**rows.attrs, "reference": references[first][begin:], "unit_length": float(unit_lengths[first])}
         if known:
             frame.attrs["metadata"] = own
-        frames[str(name)] = frame if x == EDGE_LENGTH else _with_rates(frame, x)
+        frames[str(name)] = frame
     return frames
 
 
@@ -277,32 +258,24 @@ def notes_of_left_out(store: AnyStores, frames: Mapping[str, pd.DataFrame]) -> l
     return wrapped(f"{left}: {few_of(names)}. The command status tells why.") if names else []
 
 
-def format_table(
-    store: AnyStores,
-    style: Format = "text",
-    orders: Sequence[float] | None = None,
-    *,
-    x: str = EDGE_LENGTH,
-) -> str:
+def format_table(store: AnyStores, style: Format = "text", orders: Sequence[float] | None = None) -> str:
     """Return the convergence tables of a store, or of several objects by their names, as text."""
-    frames = tables_of(store, orders, x=x)
+    frames = tables_of(store, orders)
     if style in ("csv", "json"):
         return machine_table(joined(frames), style)
     stores = stores_of(store)
     trees = {name: as_tree(stores[name]) for name in frames}
-    sections = (part for name, frame in frames.items() for part in _sections(name, trees[name], frame, x))
-    notes = notes_of_left_out(store, frames) + _notes([*trees.values()], list(frames.values()), x)
+    sections = (part for name, frame in frames.items() for part in _sections(name, trees[name], frame))
+    notes = notes_of_left_out(store, frames) + _notes([*trees.values()], list(frames.values()))
     return rendered(style, joined(frames), sections, notes)
 
 
-def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iterator[Section]:
+def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame) -> Iterator[Section]:
     if name:
         yield Section(f"Object {name}")
     marked = with_remarks(frame)
     # Meshes in the order of their names have no rates.
     columns = [one for one in _COLUMNS if one.name != "rate" or frame["rate"].notna().any()]
-    if x not in {column.name for column in columns}:
-        columns.insert(2, Column(x, x, "{:.4g}".format))
     for order, rows in marked.groupby("order", sort=False):
         yield Section(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", [(columns, rows)])
     once = marked.drop_duplicates("mesh")
@@ -343,9 +316,8 @@ def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str) -> list[str]:
-    notes = [*wrapped(_NOTE), *([] if x == EDGE_LENGTH else [f"Rates are those of distance ~ ({x})^-rate."])]
-    notes += wrapped(" ".join(unit_notes(trees)))
+def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame]) -> list[str]:
+    notes = wrapped(_NOTE) + wrapped(" ".join(unit_notes(trees)))
     if any("proximity" in tree.children for tree in trees):
         notes += wrapped(_PROXIMITY_NOTE)
     for rtol in dict.fromkeys(frame.attrs["rtol"] for frame in frames if "rtol" in frame.attrs):
@@ -370,31 +342,3 @@ def remarks(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
         reasons = finished_group(tree, "proximity")["reason"].to_series()
         failures += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]
     return [*failures, *(f"{mesh}: {doubt}" for mesh, doubt in doubts_of(tree).items())]
-
-
-def _with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:
-    """Return rows of `table` with rates in another size, in place of those in the edge length; see `sizes_of`."""
-    # All orders have the same meshes.
-    distances, errors = (frame[name].to_numpy().reshape(frame["order"].nunique(), -1) for name in ("distance", "error"))
-    count = distances.shape[1]
-    families, ordered_by = (frame[name].to_numpy()[:count] for name in ("family", "ordered_by"))
-    rates, rate_errors = rates_in_families(families, ordered_by, distances, errors, 1 / sizes_of(frame, x)[:count])
-    return frame.assign(rate=rates.ravel(), rate_error=rate_errors.ravel())
-
-
-def label_of(x: str, unit: str = "each object's unit") -> str:
-    """Return the label of an axis of sizes; one of the metadata has its name."""
-    return _LABELS[x].format(unit=unit) if x in _LABELS else x
-
-
-def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
-    """Return a column of `table`, NaN where sizes are not known; InputError where it has no such numbers."""
-    numbers = [name for name in _LABELS if name in frame]
-    given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
-    if not isinstance(x, str) or x not in (*numbers, *given):
-        only = " (the store has no families of commands, functions or searches, which have it)"
-        hint = only if str(x).startswith("make_") else ""
-        raise InputError(f"no size of meshes is named {quoted(x)}{hint}; known are {', '.join([*numbers, *given])}")
-    sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
-    # A surface in closed form has none.
-    return np.where(sizes > 0, sizes, np.nan)

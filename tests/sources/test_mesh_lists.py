@@ -17,7 +17,6 @@ from sobolev_batch.batch.prune import prune
 from sobolev_batch.errors import StudyError
 from sobolev_batch.sources.files import FileMember, FileSource, read_mesh_list
 from sobolev_batch.store.location import Location
-from sobolev_batch.tables.convergence import format_table
 from tests.support.studies import small_table
 
 
@@ -105,7 +104,7 @@ def test_a_frame_loses_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_metadata_become_coordinates_and_sizes_of_rates(tmp_path: Path) -> None:
+def test_metadata_become_coordinates_and_columns(tmp_path: Path) -> None:
     for level in (0, 1):
         sb.write_mesh(sb.shapes.icosphere(level), tmp_path / f"{level}.ply")
     frame = pd.DataFrame({"path": ["0.ply", "1.ply"], "effort": [1.0, 4.0], "tool": ["a", None]})
@@ -116,13 +115,7 @@ def test_metadata_become_coordinates_and_sizes_of_rates(tmp_path: Path) -> None:
     convergence = sb.open_store("memory://mesh-lists.zarr")["convergence"].to_dataset()
     assert convergence["tool"].sel(mesh=["f/0", "f/1"]).values.tolist() == ["a", ""]
     np.testing.assert_array_equal(convergence["effort"], [1.0, 4.0, np.nan])
-    by_effort = sb.table("memory://mesh-lists.zarr", -3, x="effort")
-    fall = np.log(by_effort["distance"][0] / by_effort["distance"][1]) / np.log(4)
-    assert by_effort["rate"][1] == pytest.approx(fall)
-    shown = format_table("memory://mesh-lists.zarr", orders=[-3.0], x="effort")
-    assert re.search(r"^mesh +triangles +effort .*\n.*\n.*\nf/1 +80 +4 ", shown, re.M)
-    with pytest.raises(sb.errors.InputError, match=r"known are edge_length, triangles, vertices, seconds, effort$"):
-        sb.table("memory://mesh-lists.zarr", x="tool")
+    assert sb.table("memory://mesh-lists.zarr", -3)["effort"].tolist() == [1.0, 4.0]
 
 
 NAMES = ["tool seconds", "weight [kg]", "50%", "größe", "c", "a*b", "x?y#z", "<b>'&", "coordinates", "index"]

@@ -189,7 +189,7 @@ def test_notes_are_those_of_all_objects(tree: xr.DataTree, near: xr.DataTree) ->
     precise = tree.copy()
     precise["convergence"].attrs["rtol"] = 0.02
     for objects in ({"a": near, "b": precise}, {"b": precise, "a": near}):
-        text = format_table(objects, x="triangles")
+        text = format_table(objects)
         assert re.findall(r"^Object (.)$", text, re.MULTILINE) == list(objects)
         assert "Hausdorff distance is between the bounds" in " ".join(text.split())
         assert "an error of at most 0.02" in " ".join(text.split())

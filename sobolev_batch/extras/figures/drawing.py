@@ -38,8 +38,9 @@ from sobolev_batch.extras.figures.style import (
 from sobolev_batch.extras.leagues.costs import CostLeague, objects_text
 from sobolev_batch.extras.leagues.evolution import evolution, has_times
 from sobolev_batch.extras.leagues.league import RELATIVE, League
+from sobolev_batch.extras.leagues.statistics import label_of, sizes_of
 from sobolev_batch.shown import few_of
-from sobolev_batch.tables.convergence import label_of, sizes_of, table
+from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import complete_meshes, finished_group, reference_of, study_unit
 
 # More labels along a front would overlap.

@@ -11,10 +11,10 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.figures.style import Style, style_of
+from sobolev_batch.extras.leagues.statistics import EDGE_LENGTH
 from sobolev_batch.norms.causes import spectrum
 from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import fits, quoted
-from sobolev_batch.tables.convergence import EDGE_LENGTH
 from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
 from sobolev_batch.tables.other_orders import distances_at
 from sobolev_batch.tables.results import FROM_COARSE_TO_FINE

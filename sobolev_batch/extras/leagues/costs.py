@@ -10,10 +10,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.extras.leagues.statistics import EDGE_LENGTH, sizes_of
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.shown import few_of, shown_tables
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import number_text, percent, wrapped
 

@@ -16,6 +16,7 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of, objects_text
 from sobolev_batch.extras.leagues.statistics import (
+    EDGE_LENGTH,
     SIGNIFICANCE,
     Curve,
     adjusted,
@@ -27,6 +28,7 @@ from sobolev_batch.extras.leagues.statistics import (
     least_objects,
     numbers_of,
     sign_flip_test,
+    sizes_of,
     within_objects,
 )
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
@@ -35,7 +37,7 @@ from sobolev_batch.parameters import as_names, check_choice
 from sobolev_batch.shown import shown_tables
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of, tables_of
+from sobolev_batch.tables.convergence import tables_of
 from sobolev_batch.tables.open import AnyStores, as_tree, objects_of, root_attribute, source_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import number_text, times, wrapped

@@ -15,6 +15,17 @@ from sobolev_batch.sources.names import quoted
 
 # Sizes at which curves are compared, evenly spaced on a logarithmic axis.
 _SIZES = 5
+EDGE_LENGTH = "edge_length"
+# Columns of a table that are sizes: the finer a mesh is, the smaller is the first, and the larger are the others.
+_LABELS = {
+    EDGE_LENGTH: "mean edge length in {unit}",
+    "triangles": "number of triangles",
+    "vertices": "number of vertices",
+    "seconds": "computing time of the mesh in seconds",
+    "make_seconds": "time of making the mesh in seconds",
+    "make_cpu_seconds": "processor time of making the mesh in seconds",
+    "make_peak_bytes": "memory of making the mesh in bytes",
+}
 # Methods whose ranges of sizes miss each other by less than this are compared between their ends.
 _LARGEST_GAP = 1.2
 # A p-value below it counts as a difference.
@@ -214,3 +225,21 @@ def adjusted(p_values: Reals) -> Reals:
     result = np.empty_like(p_values)
     result[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
     return result
+
+
+def label_of(x: str, unit: str = "each object's unit") -> str:
+    """Return the label of an axis of sizes; one of the metadata has its name."""
+    return _LABELS[x].format(unit=unit) if x in _LABELS else x
+
+
+def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
+    """Return a column of `table`, NaN where sizes are not known; InputError where it has no such numbers."""
+    numbers = [name for name in _LABELS if name in frame]
+    given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
+    if not isinstance(x, str) or x not in (*numbers, *given):
+        only = " (the store has no families of commands, functions or searches, which have it)"
+        hint = only if str(x).startswith("make_") else ""
+        raise InputError(f"no size of meshes is named {quoted(x)}{hint}; known are {', '.join([*numbers, *given])}")
+    sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
+    # A surface in closed form has none.
+    return np.where(sizes > 0, sizes, np.nan)

@@ -18,12 +18,13 @@ from sobolev_batch.errors import InputError, from_extra, write_file
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution, has_times
 from sobolev_batch.extras.leagues.league import League, percent_text
+from sobolev_batch.extras.leagues.statistics import label_of
 from sobolev_batch.parameters import path_of
 from sobolev_batch.shown import together
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.tables.convergence import label_of, table, with_remarks
+from sobolev_batch.tables.convergence import table, with_remarks
 from sobolev_batch.tables.open import (
     AnyStore,
     as_tree,
