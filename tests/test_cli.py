@@ -156,7 +156,7 @@ def test_tables_in_every_format_at_lists_of_orders(folder: Path) -> None:
     assert rf"{number} \% ±" in frames["latex"]
     matrix = output("table", "matrix", STORE, "--format", "csv", folder=folder)
     assert len(matrix.splitlines()) == 1 + 2 * 3 * 3
-    options = ("--format", "json", "--within", "99%", "--order", "-3")
+    options = ("--format", "json", "--below", "99%", "--order", "-3")
     (row,) = json.loads(output("table", "smallest", STORE, *options, folder=folder))
     assert row["mesh"] == "ico/0"
 
@@ -371,11 +371,11 @@ def test_a_command_that_has_told_something_still_says_that_it_goes_on(monkeypatc
 
 
 def test_a_terminal_has_prose_on_lines_of_its_width(folder: Path) -> None:
-    line = ("compare", "1.off", "3.off")
-    done, whole = call(*line, folder=folder, columns=40, patience_seconds=0.0), output(*line, folder=folder)
-    assert max(map(len, done.stdout.splitlines())) <= 40 < max(map(len, whole.splitlines()))
-    assert done.stdout.split() == whole.split()
-    assert "\n    " in done.stdout, "an item of a list goes on below itself"
+    for line in (("info", "1.off"), ("compare", "1.off", "3.off")):
+        done, whole = call(*line, folder=folder, columns=40, patience_seconds=0.0), output(*line, folder=folder)
+        assert max(map(len, done.stdout.splitlines())) <= 40 < max(map(len, whole.splitlines()))
+        assert done.stdout.split() == whole.split()
+        assert ("\n    " in done.stdout) == (line[0] == "info"), "an item of a list goes on below itself"
     # What stood there while it computed is gone.
     assert done.stderr.removeprefix("\r\x1b[K").startswith("compare: 0 s so far")
     assert done.stderr.endswith("\r\x1b[K")
@@ -457,7 +457,7 @@ REFUSED = [
     ("status taken", "taken: it holds no store of a study"),
     ("status 1.off", "1.off: it holds no store of a study"),
     (f"table smallest {STORE} --below much", "found 'much'"),
-    (f"table smallest {STORE} --below 5", "below 1, such as '1%', found 5"),
+    (f"table smallest {STORE} --below 5", "below 1, such as '1%', found '5'"),
     (f"table {STORE} --order -0.4", "below -1/2, found -0.4"),
     ("compare a.ply b.ply", "a.ply: cannot be read"),
     ("compare 1.off 3.off --order -4 --M 0", "M must be an even integer"),
