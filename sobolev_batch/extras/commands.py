@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,6 @@ from sobolev_batch.cli.program import EXIT_SOME_FAILED, Command
 from sobolev_batch.cli.table_commands import table_options
 from sobolev_batch.errors import (
     InputError,
-    MeshError,
     SobolevBatchError,
     StoreError,
     from_extra,
@@ -48,13 +47,8 @@ if TYPE_CHECKING:
     from sobolev_batch.extras.figures.style import PictureFormat
     from sobolev_batch.extras.figures.views import Axis, Colors
     from sobolev_batch.extras.fitting.fit import FitProgress, FitQuality
-    from sobolev_batch.geometry.mesh import Mesh
-    from sobolev_batch.geometry.surface import Similarity
     from sobolev_batch.store.location import Location
     from sobolev_batch.tables import Format
-
-# A fit may lose this fraction of the radius of its target to rounding; distances have about as many digits.
-_MOST_ROUNDING = 1e-6
 
 _folder_option = click.option(
     "--folder",
@@ -154,34 +148,12 @@ def fit_command(
     with bar or nullcontext(), Deadline.with_results(has_begun.is_set):
         fitted = method(similarity.apply(own), similarity.apply(goal), **settings, on_progress=show)
     vertices = np.asarray(fitted.mesh.vertices) / similarity.scale + np.asarray(similarity.origin)
-    result = Mesh(vertices, fitted.mesh.triangles)
-    write_mesh(result, output)
+    write_mesh(Mesh(vertices, fitted.mesh.triangles), output)
     echo(f"{len(fitted.mesh.triangles):,} triangles; {fitted.steps} steps; {fitted.end}")
     echo(f"before: {_text(fitted.before, similarity.scale)}")
     echo(f"after:  {_text(fitted.after, similarity.scale)}")
-    for remark in (*fitted.remarks, *_lost_digits(result, output, similarity)):
+    for remark in (*fitted.remarks, *read_mesh(output).notes):
         echo(f"note: {remark}")
-
-
-def _lost_digits(mesh: Mesh, path: Path, similarity: Similarity) -> Iterator[str]:
-    """Yield a remark if the file of a mesh, or the mesh's own unit, lacks digits for its vertices."""
-    import numpy as np
-
-    from sobolev_batch.geometry.formats.readers import read_mesh
-
-    try:
-        written = read_mesh(path)
-    except MeshError as error:
-        yield f"the file cannot be read back: {error}"
-        return
-    moved = float(np.finfo(np.float64).eps * np.abs(mesh.vertices).max())
-    if len(written.triangles) == len(mesh.triangles):
-        moved += float(np.abs(np.subtract(written.corners(), mesh.corners())).max())
-    if similarity.scale * moved > _MOST_ROUNDING:
-        yield (
-            f"so far from the origin, numbers in {path.name} have too few digits: vertices are off by up to "
-            f"{moved:.1g}, and the distance is not that of the file; move the meshes to the origin, or write a .ply"
-        )
 
 
 def _text(quality: FitQuality, scale: float) -> str:
