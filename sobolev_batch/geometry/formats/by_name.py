@@ -66,7 +66,6 @@ _MESHLAB = _PYTHON.format(
     "import pymeshlab; m = pymeshlab.MeshSet(); m.load_new_mesh('scan{0}'); "
     "m.generate_by_merging_visible_meshes(); m.save_current_mesh('scan.ply', save_textures=False)",
 )
-_TRIMESH = "import trimesh; trimesh.load('scan.dae').to_mesh().export('scan.ply')"
 _PYVISTA = "import pyvista; pyvista.read('scan{0}').%sextract_surface().triangulate().save('scan.vtp')"
 _GMSH = "pip install gmsh; gmsh scan{0} -2 -o scan.stl"
 _RESAVED = "pip install gmsh; gmsh scan{0} -save -format msh41 -o surface.msh"
@@ -77,7 +76,8 @@ _FLAT = f"{_MESHIO}  # where it has parts, first write it without, by noPartsInp
 CONVERTED = {
     suffix: (name, command.format(suffix))
     for name, suffixes, command in (
-        ("COLLADA", ".dae", _PYTHON.format("trimesh scipy pycollada", _TRIMESH)),
+        # Other programs leave out its skins, or cut polygons that are not convex as fans.
+        ("COLLADA", ".dae", _ASSIMP),
         *(("VRML", ".wrl", _MESHLAB), ("X3D", ".x3d", _MESHLAB), ("3D Studio", ".3ds", _MESHLAB)),
         *(("OpenCTM", ".ctm", _MESHLAB), ("STEP", ".step .stp", _GMSH), ("IGES", ".iges .igs", _GMSH)),
         *(("BREP", ".brep", _GMSH), ("Abaqus", ".inp", _FLAT), ("Nastran", ".bdf .nas", _MESHIO)),

@@ -476,7 +476,7 @@ CASES |= {
     "lightwave": (".lwo", b"FORM", "format LightWave.*assimp export scan.lwo scan.ply"),
     "draco": (".drc", b"DRACO", "format Draco.*draco_decoder -i scan.drc -o scan.ply"),
     "freesurfer's text": (".lh.pial.asc", b"#!ascii version of lh.pial\n3 1\n", "mris_convert lh.asc lh.gii"),
-    "collada": (".dae", b"<COLLADA/>", r"format COLLADA.*trimesh\.load\('scan\.dae'\)"),
+    "collada": (".dae", b"<COLLADA/>", "format COLLADA.*assimp export scan.dae scan.ply"),
     "vrml": (".wrl", b"#VRML", r"format VRML.*load_new_mesh\('scan\.wrl'\)"),
     "abaqus": (".inp", b"*Heading", "format Abaqus.*meshio convert scan.inp scan.vtu  # .* noPartsInputFile=ON"),
     "nastran": ("lh.bdf", b"BEGIN BULK", "format Nastran.*meshio convert scan.bdf scan.vtu"),

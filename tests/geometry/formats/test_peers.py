@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
+import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -219,13 +221,15 @@ OTHERS: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("suffix", OTHERS)
+NO_ASSIMP = pytest.mark.skipif(shutil.which("assimp") is None, reason="Assimp is not installed")
+
+
+@pytest.mark.parametrize("suffix", [pytest.param(one, marks=[NO_ASSIMP] * (one == ".dae")) for one in OTHERS])
 def test_the_command_of_a_refusal_converts_the_file(tmp_path: Path, suffix: str) -> None:
     OTHERS[suffix](tmp_path / f"scan{suffix}")
     with pytest.raises(MeshError, match="convert it: ") as refusal:
         read_mesh(tmp_path / f"scan{suffix}")
-    install, command = str(refusal.value).partition("convert it: ")[2].split("; ", 1)
-    assert install.startswith("pip install ")
+    command = re.sub("^pip install .*?; ", "", str(refusal.value).partition("convert it: ")[2])
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     subprocess.run(command, shell=True, check=True, cwd=tmp_path, env={**os.environ, "PATH": path}, capture_output=True)
     (made,) = [one for one in tmp_path.glob("scan.*") if one.suffix in (".ply", ".stl", ".vtu", ".vtp")]
