@@ -92,8 +92,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     The reference is the mesh that is called original, reference, target or ground truth, or else the one with the most
     triangles. Each folder is a family; the meshes of a single folder are families by their names without the number at
     the end. Where several files are called references and others belong to them by name, the study has several
-    objects, and so it has where the names of files begin as those of finer ones, in any folder. A mesh alone is
-    compared with decimated versions of itself. Files are looked at, and only small ones are read.
+    objects, and so it has where the names of files begin as those of finer ones, in any folder. References alone are
+    compared with decimated versions of themselves. Files are looked at, and only small ones are read.
 
     Args:
         folder: Folder with meshes, in it or in folders below.
@@ -129,7 +129,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     if problem := _path_problem(str(below)):
         raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
     sizes, extents, left_out = _look_at(folder)
-    references = _references(sizes) or {"": _reference(folder, sizes, left_out)}
+    are_all = _REFERENCES.fullmatch(folder.resolve().name) is not None
+    references = _references(sizes, are_all=are_all) or _references(sizes) or {"": _reference(folder, sizes, left_out)}
     families = _families(sizes, references)
     used = {*references.values(), *chain.from_iterable(families.values())}
     doubts = {
@@ -142,7 +143,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     if "" in references:
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
-        sections, summary = _several_objects(references, families, below)
+        alone = () if families else _originals(references, sizes, below)
+        sections, summary = alone or _several_objects(references, families, below)
     lacks = "no other mesh belongs to it by name, nor it to one"
     left_out |= {str(path): lacks for path in sizes if path not in used}
     name = _json(_free_name(folder.resolve().name, fallback="study"))
@@ -230,17 +232,23 @@ def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes")
     return next(candidate for candidate in numbered if caseless_key(candidate) not in known)
 
 
-def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
+def _references(sizes: Mapping[PurePosixPath, int], *, are_all: bool = False) -> dict[str, PurePosixPath]:
     """Return the references by their objects; none where all files are of one object.
 
-    There are several objects if several files are called references, of which some have files of their names.
+    There are several objects if several files are called references, as all are in a folder that is called so, of which
+    some have files of their names, or where there are no other files at all.
     """
-    called = [path for path in sizes if _is_called_reference(path)]
+    called = [path for path in sizes if are_all or _is_called_reference(path)]
     references = {_object_of(path): path for path in called} or _continued(sizes)
     owners = {name for name, *_ in _owned(sizes, references)}
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called or references)
     is_refused = any(name_problem(name, _LONGEST_NAME, RESERVED) or name.startswith((".", "__")) for name in references)
-    return {name: path for name, path in references.items() if name in owners and are_different and not is_refused}
+    if not are_different or is_refused:
+        return {}
+    # Names that others continue, as cow and cow_500, are those of one object.
+    is_continued = any(re.match(rf"{re.escape(name)}[\W_]", own) for own in references for name in references)
+    is_alone = len(called) == len(sizes) and not is_continued
+    return references if is_alone else {name: path for name, path in references.items() if name in owners}
 
 
 def _continued(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
@@ -360,10 +368,26 @@ def _one_object(
         summary.append(f"family {family}: {size}")
     others = [path for paths in families.values() for path in paths]
     if others and all(sizes[path] >= _AS_FINE * triangles or _is_called_reference(path) for path in others):
-        summary.append("are these objects of their own? if so, add meshes with their names: METHOD/NAME_500.ply")
+        summary.append("are these objects of their own? if so, move them into a folder called originals, and init that")
     if counts:
         sections.append(_filled("optional" if families else "decimated", counts=counts))
     return sections, tuple(summary)
+
+
+def _originals(
+    references: Mapping[str, PurePosixPath], sizes: Mapping[PurePosixPath, int], folder: PurePosixPath
+) -> tuple[list[str], tuple[str, ...]]:
+    """Return the sections of a study of originals alone, which decimates them, and what they hold."""
+    path, *others = {str(folder / path).replace(name, OBJECT) for name, path in references.items()}
+    counts = [count for part in _FRACTIONS if (count := min(sizes.values()) // part) >= _FEWEST_TRIANGLES]
+    if others or not counts:
+        raise StudyError(
+            f"there are originals alone ({few_of([*map(str, references.values())])}), with nothing to compare; add "
+            f"meshes with their names, such as METHOD/{next(iter(references))}_500.ply"
+        )
+    summary = f"{_objects_text(references)}, each compared with decimated versions of itself"
+    remark = "new files of this kind are objects too"
+    return [_filled("reference", remark=remark, path=_json(path)), _filled("decimated", counts=counts)], (summary,)
 
 
 def _several_objects(

@@ -177,11 +177,39 @@ def test_names_that_are_dates_are_those_of_a_family(tmp_path: Path) -> None:
     assert [family.name for family in as_study(found.path).object.families] == ["scans"]
 
 
-@pytest.mark.parametrize("folder", ["scans", "originals"])
-def test_meshes_that_may_be_objects_of_their_own_are_asked_about(tmp_path: Path, folder: str) -> None:
-    for name, level in (("scan_1", 2), ("scan_2", 2 - (folder == "originals"))):
-        write(tmp_path / folder / f"{name}.ply", level)
-    assert "are these objects of their own?" in str(sb.init_study(tmp_path, tmp_path / "study.toml"))
+@pytest.mark.parametrize("template", ["originals/{}.ply", "{}_original.ply", "{}/original.ply"])
+def test_originals_alone_are_compared_with_their_decimations(tmp_path: Path, template: str) -> None:
+    for level, name in enumerate(("cow", "cowboy"), start=2):
+        write(tmp_path / "meshes" / template.format(name), level)
+    found = sb.init_study(tmp_path / "meshes", tmp_path / "study.toml")
+    assert found.summary == ("2 objects: cow, cowboy, each compared with decimated versions of itself",)
+    assert found.left_out == {}
+    for name, one in as_study(found.path).objects.items():
+        (reference,) = one.reference.members(tmp_path)  # type: ignore[union-attr]
+        assert reference.name == Path(template.format(name)).stem
+        assert [*one.members] == [*(f"quadric decimation/{count}" for count in (20, 40, 80, 160)), "reference"]
+
+
+def test_a_folder_called_originals_holds_objects_of_their_own(tmp_path: Path) -> None:
+    """Meshes as fine as each other, in another folder, are taken for one object; then the draft asks."""
+    for folder, name in product(("scans", "Originals"), ("scan_1", "scan_2")):
+        write(tmp_path / folder / f"{name}.ply", 2)
+    one, several = (sb.init_study(tmp_path / folder, tmp_path / f"{folder}.toml") for folder in ("scans", "Originals"))
+    assert [*as_study(one.path).objects] == [""]
+    assert "objects of their own? if so, move them into a folder called originals, and init that" in str(one)
+    assert [*as_study(several.path).objects] == ["scan_1", "scan_2"]
+    assert "objects of their own" not in str(several)
+    for name in ("cow.ply", "cow_80.ply", "pig.ply", "pig_80.ply"):
+        write(tmp_path / "objects" / name, 1 + ("_" not in name))
+    with_versions = sb.init_study(tmp_path / "objects", tmp_path / "objects.toml")
+    assert [*as_study(with_versions.path).objects] == ["cow", "pig"]
+
+
+def test_originals_alone_whose_names_follow_no_pattern_need_other_meshes(tmp_path: Path) -> None:
+    for path in ("originals/cow.ply", "originals/egg.obj"):
+        write(tmp_path / path, 2)
+    with pytest.raises(sb.errors.StudyError, match=r"originals alone .*; add meshes .* such as METHOD/cow_500\.ply"):
+        sb.init_study(tmp_path, tmp_path / "study.toml")
 
 
 def test_meshes_far_larger_than_their_reference_are_named(tmp_path: Path) -> None:
