@@ -207,7 +207,7 @@ def test_a_program_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> No
 def test_a_process_that_is_killed_before_its_program_begins_leaves_no_folder(tmp_path: Path) -> None:
     run = (
         "import os; import sobolev_batch as sb; from sobolev_batch.sources import programs; "
-        "programs._write = lambda *_: os.kill(os.getpid(), 9); "
+        "programs.write_mesh = lambda *_: os.kill(os.getpid(), 9); "
         "programs.run_command(sb.shapes.icosphere(0), ['true'], ('.ply', '.ply'), 1000.0, 10**9)"
     )
     ended = subprocess.run([sys.executable, "-c", run], env=os.environ | {"TMPDIR": str(tmp_path)})
