@@ -59,9 +59,7 @@ def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
         kind, key = item["type"], _key_in(values, item)
         name = _named(key, values)
         if kind == "extra_forbidden":
-            owner = _section_of(str(key[-1]))
-            hint = f"it belongs to [{owner}]" if owner else known_names(str(key[-1]), _known_keys(values, key[:-1]))
-            messages.append(f"{name} is unknown; {hint}")
+            messages.append(f"{name} is unknown; {known_names(str(key[-1]), _known_keys(values, key[:-1]))}")
         elif kind == "missing":
             hint = f"; {MESH_HINT}" if key[-1] == "mesh" else ""
             messages.append(f"{name} is missing{hint}")
@@ -107,18 +105,6 @@ def _key_in(values: object, item: ErrorDetails) -> _Key:
 
 def _value_at(values: Any, key: _Key) -> Any:
     return reduce(getitem, key, values)
-
-
-def _section_of(key: str) -> str | None:
-    """Return the section of settings that has a key, which was found at another place; None where none has."""
-    fields = schema.StudyDocument.model_fields.items()
-    sections = [
-        name
-        for name, field in fields
-        if name not in (*_REPEATED, "mesh", "objects", "reference")
-        and any(key in model.model_fields for model in schema.models_in(field.annotation))
-    ]
-    return sections[0] if len(sections) == 1 else None
 
 
 def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:
