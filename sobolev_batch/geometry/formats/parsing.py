@@ -107,6 +107,8 @@ def read_unpacked(path: Path, factor: float, read: Read = BufferedReader.read) -
             if not packed:
                 require_memory_to_read(factor * length)
             data = read(file, length)
+            if not len(data) == length == checked_length(file):
+                raise MeshError("it changed while it was read; read it again once it is whole")
         if packed:
             data = _unpacked_bounded(data, factor)
     except gzip.BadGzipFile as error:

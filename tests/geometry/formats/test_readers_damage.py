@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gzip
+import os
 import pickle
 import re
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 
 from sobolev_batch import read_mesh
 from sobolev_batch.errors import MeshError
+from sobolev_batch.geometry.formats.readers import read_mesh_by
 from tests.support.mesh_files import (
     BIG,
     BOXES,
@@ -275,6 +278,19 @@ def test_empty_and_missing_files_and_folders_are_told_apart(tmp_path: Path, endi
     for content in (b"", gzip.compress(b""))[: 1 + ending.endswith(".gz")]:
         path.write_bytes(content)
         assert refusal(path) == "the file is empty"
+
+
+@pytest.mark.parametrize("length", [len(OBJ_BOX) + 9, len(OBJ_BOX) // 2])
+def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path: Path, length: int) -> None:
+    path = tmp_path / "scan.obj"
+    path.write_bytes(OBJ_BOX)
+
+    def read(file: BufferedReader, wanted: int) -> bytes:
+        os.truncate(path, length)
+        return file.read(wanted)
+
+    with pytest.raises(MeshError, match=r"scan\.obj: .*it changed while it was read"):
+        read_mesh_by(path, read)
 
 
 @pytest.mark.parametrize(
