@@ -393,9 +393,11 @@ def test_a_terminal_has_data_and_commands_as_they_are(folder: Path) -> None:
 
 def test_what_mesh_files_hold(folder: Path) -> None:
     whole = ball(1)
-    sb.write_mesh(sb.Mesh(whole.vertices, whole.triangles[2:]), folder / "open.off")
+    # Far from each other, two triangles are missing.
+    sb.write_mesh(sb.Mesh(whole.vertices, whole.triangles[1:-1]), folder / "open.off")
     shown = output("info", "1.off", "open.off", folder=folder)
     assert re.findall(r"^(\S+): (\d+) triangles, 42 vertices$", shown, re.M) == [("1.off", "80"), ("open.off", "78")]
+    assert re.findall("(.*) boundary loops", shown) == ["  2"]
     assert "closed, all triangles face outwards" in shown
     assert "none: it is not closed" in shown
     closed, opened = document("info", "1.off", "open.off", folder=folder)["files"]
@@ -406,6 +408,7 @@ def test_what_mesh_files_hold(folder: Path) -> None:
     assert (closed["boundary_edges"], opened["volume"]) == (0, None)
     assert opened["boundary_edges"] > 0
     assert f"{opened['boundary_edges']} open edges" in shown
+    assert (closed["boundary_loops"], opened["boundary_loops"]) == (0, 2)
 
 
 @pytest.mark.parametrize(

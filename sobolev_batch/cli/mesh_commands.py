@@ -183,6 +183,8 @@ def _fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:
         f"aspect ratio up to {facts['aspect_ratio']:.3g} (median {facts['aspect_ratio_median']:.3g})"
     )
     yield f"  {'; '.join(facts['defects']) or 'closed, all triangles face outwards'}"
+    if loops := facts["boundary_loops"]:
+        yield f"  {loops:,} boundary loop{'s' * (loops != 1)}"
     if facts["components"] > 1:
         closed = "" if facts["boundary_edges"] else "closed "
         inside = f", {facts['nested']:,} inside others" if facts["nested"] else ""
@@ -196,7 +198,7 @@ def _facts(path: Path, mesh: Mesh) -> dict[str, Any]:
     """Return what is known of a mesh by itself, lengths in its own unit."""
     import numpy as np
 
-    from sobolev_batch.geometry.parts import nested_parts
+    from sobolev_batch.geometry.parts import boundary_loops, nested_parts
 
     merged = mesh.merged or mesh
     angles, ratios = mesh.smallest_angles, mesh.aspect_ratios
@@ -212,6 +214,7 @@ def _facts(path: Path, mesh: Mesh) -> dict[str, Any]:
         "aspect_ratio": float(ratios.max()),
         "aspect_ratio_median": float(np.median(ratios)),
         **merged.counts,
+        "boundary_loops": boundary_loops(merged),
         "nested": nested_parts(merged),
         "defects": mesh.defects,
         "notes": mesh.notes,

@@ -1,4 +1,4 @@
-"""The connected parts of a mesh, and which of them lie inside others."""
+"""The connected parts of a mesh, which of them lie inside others, and the loops of its boundary."""
 
 import igl
 import numpy as np
@@ -33,3 +33,15 @@ def nested_parts(mesh: Mesh) -> int:
         if others.size:
             is_inside[others] = np.abs(igl.fast_winding_number(mesh.vertices, own, points[others])) > 1 / 2
     return int(np.count_nonzero(is_inside))
+
+
+def boundary_loops(mesh: Mesh) -> int:
+    """Return how many parts, which share no vertices, the open edges form, such as the rims of holes.
+
+    >>> import sobolev_batch as sb
+    >>> ball = sb.shapes.icosphere(2)
+    >>> boundary_loops(ball), boundary_loops(sb.Mesh(ball.vertices, ball.triangles[4:-4]))
+    (0, 2)
+    """
+    edges = igl.boundary_facets(mesh.triangles)[0]
+    return len(np.unique(igl.vertex_components(edges)[edges[:, 0]])) if len(edges) else 0
