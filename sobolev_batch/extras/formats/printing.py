@@ -26,6 +26,8 @@ _UNIT, _SUPPORTS = "millimeter", ("support", "solidsupport")
 _AS_IT_IS = "1 0 0 0 1 0 0 0 1 0 0 0"
 # Extensions that do not change what is built, by words of their names.
 _HARMLESS = ("/material/", "/production/", "/trianglesets/")
+# Shapes of extensions, which a file need not require.
+_UNREAD = frozenset(("beamlattice", "booleanshape", "displacementmesh", "levelset"))
 # Where slicers say what they print in another way, or not at all.
 _SETTINGS = ("/slic3r_pe_model.config", "/model_settings.config")
 _UNLIKE = re.compile(rb'subtype="(?!normal_part)|"(?:ParameterModifier|NegativeVolume|SupportEnforcer|SupportBlocker)"')
@@ -56,6 +58,7 @@ class _Package:
         self.parts: dict[str, dict[str, _Object]] = {}
         self.items: list[_Placing] = []
         self.units: set[str] = set()
+        self.unread: set[str] = set()
         self.supports = self.unprinted = self.size = 0
 
     def read(self, name: str) -> bytes:
@@ -82,6 +85,8 @@ class _Package:
                 meaning = values.get(f"xmlns:{prefix}" if prefix else "xmlns")
                 prefixes = {prefix, *(key[len("xmlns:") :] for key in values if values[key] == meaning)}
             match event, word if prefix in prefixes else "":
+                case "start", "" if word in _UNREAD:
+                    self.unread.add(word)
                 case "start", "model":
                     self.units.add(values.get("unit", _UNIT))
                     names = [
@@ -144,6 +149,10 @@ def parse_3mf(data: bytes) -> Raw:
     settings = b"".join(package.read(name) for name in package.names if name.endswith(_SETTINGS))
     if others := len(_UNLIKE.findall(settings)):
         notes.append(f"{others} parts that the slicer calls modifiers, negative or for supports count like all others")
+    if package.unread:
+        notes.append(
+            f"shapes of the kind {', '.join(sorted(package.unread))} are left out, which extensions of 3MF define"
+        )
     if package.unprinted:
         notes.append(f"{package.unprinted} items that the slicer does not print count like all others")
     return Raw(*joined(parts), tuple(notes))

@@ -738,6 +738,11 @@ NOTED: dict[str, tuple[str, bytes, str]] = {
             ("model_settings", "usual part", '<part id="1" subtype="normal_part">', 0),
         )
     },
+    "3mf, beams that it does not require": (
+        ".3mf",
+        package_3mf(model(BOX_3MF.replace("</mesh>", '<b:beamlattice radius="1" xmlns:b="http://x"/></mesh>'))),
+        "shapes of the kind beamlattice are left out",
+    ),
     "3mf, not to be printed": (
         ".3mf",
         package_3mf(model(BOX_3MF, '<item objectid="1" printable="0"/>')),
