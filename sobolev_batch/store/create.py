@@ -88,15 +88,14 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     """
     store = Store(location)
     try:
-        exists = store.exists()
+        if not store.exists():
+            store.location.require_free(besides=LOCK_KEYS)
+        if not store.exists() or store.is_unfinished:
+            _create(store, plan)
+            return store
+        attributes, lattice = store.attributes(), _lattice_entry(plan)
     except DamageError as damage:
         return _mended(store, plan, damage)
-    if not exists:
-        store.location.require_free(besides=LOCK_KEYS)
-    if not exists or store.is_unfinished:
-        _create(store, plan)
-        return store
-    attributes, lattice = store.attributes(), _lattice_entry(plan)
     if not store.has_digest():
         is_same = attributes["study"].items() >= {"name": plan.name, **lattice}.items()
         altered = DamageError("the metadata at the root are damaged", "they are not what was written")

@@ -14,8 +14,8 @@ from sobolev_batch.store.encoding import ROOT, group_document
 from sobolev_batch.store.layout import DIGEST, RECORDS, Store, document_digest
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, Time, age_seconds
+from sobolev_batch.store.metadata import damaged_record, record_in
 from sobolev_batch.store.objects import Objects, root_of
-from sobolev_batch.store.records import damaged_record, record_in
 
 # A run counts as lost if its record was not renewed for this time.
 LOST_AFTER_SECONDS = 60.0

@@ -26,9 +26,11 @@ import numpy as np
 import xarray as xr
 import zarr
 from numpy.typing import ArrayLike
+from pydantic import create_model
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import StorePath
 
+from sobolev_batch.arrays import ComplexDtype
 from sobolev_batch.errors import DamageError, ForeignError, InputError, StoreError, one_line
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
@@ -42,6 +44,7 @@ from sobolev_batch.store.metadata import (
     chunk_shape,
     consolidated,
     problems_of,
+    record_in,
 )
 from sobolev_batch.study.lattice_choice import LatticeChoice
 
@@ -80,6 +83,14 @@ Hashes = dict[str, tuple[str, str]]
 Metadata = tuple[dict[str, Document], Hashes]
 # Tasks write into the chunks of these groups; all others are tables, written, listed and hidden as a whole.
 GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, SPECTRA_GROUP, RECORDS)
+# What is read of the attribute "study" of every root, and besides of that of one object, and of several.
+_TABLE = create_model("_TABLE", study=(dict[str, Any], ...))
+_OF_ANY = create_model("_OF_ANY", name=(str, ...), orders=(list[float], ...), table=(_TABLE, ...))
+_LATTICE = create_model("_LATTICE", xi_max=(float, ...), M=(int, ...))
+_OF_ONE = create_model(
+    "_OF_ONE", __base__=_OF_ANY, lattice=(_LATTICE, ...), dtype=(ComplexDtype, ...), reference=(str, ...)
+)
+_OF_OBJECTS = create_model("_OF_OBJECTS", __base__=_OF_ANY, objects=(list[str], ...))
 
 
 class Store:
@@ -173,6 +184,8 @@ class Store:
                 "run the study again into another store, or read this one with the version that has written it"
             )
         has_objects = OBJECTS in attributes["study"]
+        kind: Any = _OF_OBJECTS if has_objects else _OF_ONE
+        record_in(kind, attributes["study"], f'{self.path}: the attribute "study" of {ROOT}')
         if of_objects and not has_objects:
             raise ForeignError(f"{self.path}: the store of one object, and the study names several; name another store")
         if has_objects and of_objects is False:
@@ -214,6 +227,14 @@ class Store:
     def labels(self) -> tuple[str, ...]:
         """Return the label of each row."""
         return self.read_strings(LABELS)
+
+    @property
+    def reference(self) -> int:
+        """Row of the reference."""
+        labels, reference = self.labels(), self.attributes()["study"]["reference"]
+        if reference not in labels:
+            raise self.damage(ROOT, f"it has no mesh {reference!r}, which is its reference")
+        return labels.index(reference)
 
     def names_of_rows(self, count: int) -> Sequence[str]:
         """Return what messages call rows: their labels, or their numbers where labels are damaged."""

@@ -9,8 +9,12 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeGuard
+from functools import cache
+from typing import Any, TypeGuard, TypeVar, cast
 
+from pydantic import TypeAdapter, ValidationError
+
+from sobolev_batch.errors import DamageError
 from sobolev_batch.sources.names import node_problem
 
 # The layout that docs/store.md describes has this version.
@@ -37,6 +41,8 @@ _MOST_ELEMENTS = {0: 1, 1: 10**7, 2: 10**8}
 _LONGEST_AXIS = 2**40
 # These have values of all meshes, of which a few are read at a time: samples of octaves, and spectra.
 _OF_MESHES = re.compile("octaves/octaves|spectra/.*")
+Kind = TypeVar("Kind")
+_adapter: Any = cache(TypeAdapter)
 
 
 def chunk_shape(document: Mapping[str, Any]) -> list[int]:
@@ -70,6 +76,21 @@ def mapping_in(text: str) -> dict[str, Any]:
         return dict(json.loads(text))
     except (TypeError, RecursionError) as error:
         raise ValueError(f"no table: {error}") from error
+
+
+def record_in(kind: type[Kind], table: Any, name: str) -> Kind:
+    """Return the record that a table of JSON holds; DamageError where it holds something else."""
+    try:
+        return cast(Kind, _adapter(kind).validate_python(table))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        problem = ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
+        raise damaged_record(name, problem, table) from error
+
+
+def damaged_record(name: str, problem: str, content: object) -> DamageError:
+    """Return the error for a record, by its name, whose content is not what was written."""
+    return DamageError(f"{name} is damaged ({problem}): {str(content)[:80]!r}; run the study again", problem)
 
 
 def problems_of(documents: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

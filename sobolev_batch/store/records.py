@@ -10,10 +10,9 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict
 
 from sobolev_batch.errors import DamageError
 from sobolev_batch.geometry.mesh import Mesh
@@ -22,7 +21,7 @@ from sobolev_batch.sources.programs import Cost
 from sobolev_batch.store.checked import largest_chunk_bytes
 from sobolev_batch.store.layout import PAGE, RECORD, Store
 from sobolev_batch.store.lock import Time
-from sobolev_batch.store.metadata import chunk_shape
+from sobolev_batch.store.metadata import chunk_shape, damaged_record, record_in
 from sobolev_batch.transform.fourier import NUMERICS_VERSION
 
 _log = logging.getLogger(__name__)
@@ -32,8 +31,6 @@ Status = Literal["complete", "failed"]
 _ROW = "row"
 # This JSON takes the place of a record that a page holds and that counts no more.
 _WITHDRAWN = "null"
-Kind = TypeVar("Kind")
-_adapter: Any = cache(TypeAdapter)
 
 
 @dataclass(frozen=True)
@@ -298,18 +295,3 @@ class Records(Generic[RecordType]):
     def _rows_per_page(self) -> int:
         """Number of rows of a page; the last page may have fewer."""
         return chunk_shape(self.store.document(PAGE))[0]
-
-
-def record_in(kind: type[Kind], table: Any, name: str) -> Kind:
-    """Return the record that a table of JSON holds; DamageError where it holds something else."""
-    try:
-        return cast(Kind, _adapter(kind).validate_python(table))
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        problem = ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
-        raise damaged_record(name, problem, table) from error
-
-
-def damaged_record(name: str, problem: str, content: object) -> DamageError:
-    """Return the error for a record, by its name, whose content is not what was written."""
-    return DamageError(f"{name} is damaged ({problem}): {str(content)[:80]!r}; run the study again", problem)

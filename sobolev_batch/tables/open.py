@@ -1,6 +1,7 @@
 """A store that is open for reading, and what it has: groups, orders, families and units."""
 
 import logging
+import struct
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -30,7 +31,7 @@ _SOURCE, _STATE = "source", "state"
 # Groups that may be larger than the memory: xarray computes with them chunk by chunk.
 _LARGE = {"fourier", layout.OCTAVES_GROUP, layout.SPECTRA_GROUP}
 # What zarr and xarray raise for metadata that nobody has written.
-_MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
+_MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, struct.error)
 
 
 def open_store(store: str | Path | Location) -> xr.DataTree:

@@ -43,7 +43,7 @@ def stored_evaluator(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Ev
     for mesh in meshes:
         if places.get(mesh) not in complete:
             raise _no_field(tree, mesh, labels[:3])
-    rows, reference = [places[mesh] for mesh in meshes], places[store.attributes()["study"]["reference"]]
+    rows, reference = [places[mesh] for mesh in meshes], store.reference
     qualities = {row: record.quality for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
     compared_with = rows[-1] if rows else None

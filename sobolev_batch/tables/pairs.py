@@ -62,9 +62,8 @@ class Pairs:
         """Return the distances of all pairs by the tables of a store, which it may lack."""
         rows, status, keys = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
         complete = {row: key for row, key, state in zip(rows, keys, status, strict=True) if state == "complete"}
-        study = store.attributes()["study"]
-        reference = store.labels().index(study["reference"])
-        return cls(store, tuple(sorted(rows)), complete, tuple(study["orders"]), reference)
+        orders = tuple(store.attributes()["study"]["orders"])
+        return cls(store, tuple(sorted(rows)), complete, orders, store.reference)
 
     def lay_out(self, coordinates: xr.Dataset) -> None:
         """Lay out the arrays, with coordinates of tables, for `Store.consolidate`; tiles that exist stay."""

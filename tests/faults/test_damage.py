@@ -311,6 +311,9 @@ ROOT = "consolidated_metadata", "metadata"
         (("attributes", "similarity", "scale"), 2.0, True),
         (("attributes", "study", "lattice", "M"), 18, True),
         ((*ROOT, "fourier/fourier", "shape"), [5, 18, 17, 9], True),
+        (("attributes", "study", "reference"), "nobody", True),
+        (("attributes", "study", "lattice"), {}, False),
+        (("attributes", "similarity", "scale"), 0, False),
         ((*ROOT, "meshes/area", "fill_value"), "x", False),
         ((*ROOT, "meshes/area", "codecs"), [{"name": "bytes"}], False),
         ((*ROOT, "meshes/area", "dimension_names"), ["a", "b", "c"], False),
@@ -337,6 +340,7 @@ def test_metadata_at_the_root_that_were_altered(
     else:
         with pytest.raises(DamageError):
             open_store(store)["meshes"].to_dataset().load()
+        mended()
 
 
 @pytest.mark.parametrize("count", [3, 9])

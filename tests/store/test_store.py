@@ -20,7 +20,7 @@ from distributed import Client
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
-from sobolev_batch import Study, open_store, plan, run, unlock, verify
+from sobolev_batch import Study, matrix, open_store, plan, run, unlock, verify
 from sobolev_batch.batch.prune import prune
 from sobolev_batch.batch.status import status
 from sobolev_batch.errors import DamageError, LockError, StoreError
@@ -241,6 +241,16 @@ def with_a_file_for_a_folder(store: Path) -> None:
     folder.write_text("")
 
 
+def with_other_entry(name: str, value: object) -> Callable[[Path], None]:
+    """Change an entry of the study at a root."""
+
+    def changed(root: Document) -> None:
+        study = json.loads(root["attributes"]["study"])
+        root["attributes"]["study"] = json.dumps({**study, name: value})
+
+    return lambda store: change(store, "", changed)
+
+
 # What no checksum knows of, and what libraries have errors of their own for.
 SENSELESS: dict[str, Callable[[Path], object]] = {
     "study": lambda store: change(store, "", lambda root: root["attributes"].update(study=1)),
@@ -248,6 +258,11 @@ SENSELESS: dict[str, Callable[[Path], object]] = {
     "similarity": lambda store: change(
         store, "", lambda root: root["attributes"].update(similarity='{"scale": 0, "origin": [0, 0, 0]}')
     ),
+    "name": with_other_entry("name", None),
+    "lattice": with_other_entry("lattice", {"M": 16}),
+    "orders": with_other_entry("orders", ["x"]),
+    "table": with_other_entry("table", {"study": []}),
+    "fill value": lambda store: change(store, "fourier/xi_x", lambda node: node.update(attributes={"_FillValue": ""})),
     "no similarity": lambda store: change(store, "", lambda root: root["attributes"].pop("similarity")),
     "codec": lambda store: change(
         store, "norms/norm", lambda node: node["codecs"][0].update(configuration={"endian": True})
@@ -265,6 +280,14 @@ def test_what_makes_no_sense_is_damage(copy: Path, name: str) -> None:
         [group.to_dataset().load() for group in open_store(copy).subtree]
     with suppress(DamageError):
         assert not verify(copy).is_sound
+
+
+def test_a_reference_that_is_no_mesh_is_named(copy: Path) -> None:
+    with_other_entry("reference", "nobody")(copy)
+    Store.open(copy).consolidate()
+    for use in (verify, lambda store: matrix(store, -3.5)):
+        with pytest.raises(DamageError, match="no mesh 'nobody'"):
+            use(copy)
 
 
 def test_a_number_of_no_row_is_that_of_a_mesh_without_record(copy: Path) -> None:
