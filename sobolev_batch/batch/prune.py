@@ -1,5 +1,6 @@
 """Pruning: what a store keeps and no record needs, counted and removed."""
 
+import re
 from collections import Counter
 from contextlib import nullcontext
 
@@ -16,6 +17,8 @@ _LOST, _KILLED, _UNLISTED = (
     "leftovers of runs that were killed, and earlier fields of meshes that fail now",
     "tables that the store does not list",
 )
+# Other programs may leave files of their own beside those of rows.
+_OF_ROW = re.compile(rf"((?:{FIELD}|{OCTAVES})/c/([0-9]+))/")
 
 
 def prune_lost_objects(location: Location, *, is_dry: bool = True) -> int:
@@ -46,14 +49,12 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
         counts: Counter[str] = Counter()
         prefixes = set()
         for key, size in location.sizes("").items():
-            array = next((name for name in (FIELD, OCTAVES) if key.startswith(f"{name}/c/")), "")
             if PARTIAL_FILE.search(key):
                 counts[_KILLED] += size
-            elif array:
-                row = int(key.removeprefix(f"{array}/c/").split("/")[0])
-                if row not in kept:
+            elif place := _OF_ROW.match(key):
+                if (row := int(place[2])) not in kept:
                     counts[_LOST if row in lost else _KILLED] += size
-                    prefixes.add(f"{array}/c/{row}")
+                    prefixes.add(place[1])
             elif (group := key.split("/")[0]) not in listed:
                 counts[_UNLISTED] += size
                 prefixes.add(group)

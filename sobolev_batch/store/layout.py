@@ -428,7 +428,7 @@ class Store:
         """Return the numbers of the stored chunks of an array along its only axis. Its metadata need not be there."""
         prefix = f"{name}/c/"
         numbers = (key.removeprefix(prefix) for key in self.location.sizes(prefix.rstrip("/")))
-        return sorted(int(number) for number in numbers if number.isdigit())
+        return sorted(int(number) for number in numbers if number.isdecimal())
 
     def incomplete_chunks(self, name: str, sizes: Mapping[str, int]) -> list[tuple[int, ...]]:
         """Return the indices of an array's chunks that are missing, or of a wrong length by the sizes of its keys."""
