@@ -29,12 +29,14 @@ _GROUP = 32
 _READ_AT_ONCE = 8
 # For fewer rows than this, products do not earn what arranging the samples costs: pairs are taken one by one.
 _FEWEST_ROWS = 4
-# Two surfaces may not have been compared beyond the octaves. Their mean energy there is at least this fraction of the
-# last measured one; or less by what that lacks of the sum of both own ones, since close sheets of the little that
-# differs count several times there. It exceeds the sum by no more than this multiple of the last distance from it; or
-# this fraction of it, where the energy has just grown by more than a factor from octave to octave. Below the sum, it is
-# by no more than that multiple of the last excess.
-_LEAST_LIMIT, _SWING, _RISE, _STEEPEST_GROWTH = 0.7, 1.25, 0.9, 2.5
+# Two surfaces may not have been compared beyond the octaves. At these orders, their mean energy there is at least this
+# fraction of the last measured one, a little below what parallel sheets at any gap leave; or less by what that lacks of
+# the sum of both own ones, since close sheets of the little that differs count several times there. It exceeds the sum
+# by no more than this factor, which such sheets reach, or this multiple of the last distance from it; or this fraction
+# of it, where the energy has just grown by more than a factor from octave to octave. Below the sum, it is by no more
+# than that multiple of the last excess.
+_AT_ORDERS, _LEAST_LIMITS = (-4.0, -2.5, -1.5, -1.0, -0.5), (0.25, 0.31, 0.4, 0.45, 0.5)
+_MOST, _SWING, _RISE, _STEEPEST_GROWTH = (1.87, 1.75, 1.55, 1.35, 1.05), 1.25, 0.9, 2.5
 # Rows of a tile whose values in octaves are held at a time take this many bytes.
 _HELD_BYTES = 128 << 20
 # Bytes of a sample of octaves: frequency, weight, place, values of three fields with squares, and its move to radii.
@@ -429,16 +431,17 @@ class Evaluator:
         total = sum(energies)
         least, largest = ((math.sqrt(energies[0]) + sign * math.sqrt(energies[1])) ** 2 for sign in (-1, 1))
         swing = max(_SWING * abs(total - last), _RISE * total if last > _STEEPEST_GROWTH * before else 0.0)
-        lowest = min(_LEAST_LIMIT * last, 2 * last - total, total, max(total - _SWING * (last - total), least))
-        highest = max(total, min(total + swing, largest))
-        found = Remainder.between(max(lowest, 0.0), highest, cutoff).at(self.orders)
-        if not self._from_reference.keys() >= {row, other}:
-            return found
-        known = found, self._from_reference[row], self._from_reference[other]
-        low, high = (np.maximum([values + sign * errors for values, errors in known], 0.0) for sign in (-1, 1))
-        nearest, farthest = np.sqrt(low[1:]), np.sqrt(high[1:])
-        upper = np.minimum(high[0], farthest.sum(axis=0) ** 2)
-        lower = np.clip(low[0], np.maximum(nearest - farthest[::-1], 0.0).max(axis=0) ** 2, upper)
+        limit, most = (np.interp(self.orders, _AT_ORDERS, values) for values in (_LEAST_LIMITS, _MOST))
+        lowest = np.minimum(limit * last, min(2 * last - total, total, max(total - _SWING * (last - total), least)))
+        highest = np.minimum(np.maximum(most * total, total + swing), largest)
+        unit, off = Remainder.between(1.0, 1.0, cutoff).at(self.orders)
+        lower, upper = np.maximum(lowest, 0.0) * (unit - off), highest * (unit + off)
+        if self._from_reference.keys() >= {row, other}:
+            known = self._from_reference[row], self._from_reference[other]
+            low, high = (np.maximum([values + sign * errors for values, errors in known], 0.0) for sign in (-1, 1))
+            nearest, farthest = np.sqrt(low), np.sqrt(high)
+            upper = np.minimum(upper, farthest.sum(axis=0) ** 2)
+            lower = np.clip(lower, np.maximum(nearest - farthest[::-1], 0.0).max(axis=0) ** 2, upper)
         return (lower + upper) / 2, (upper - lower) / 2
 
     def sums_over_shells(self, rows: Sequence[int]) -> Reals:

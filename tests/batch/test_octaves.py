@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import trimesh
 from distributed import Client
-from scipy.integrate import dblquad
 
 import sobolev_batch as sb
 from sobolev_batch.store.layout import Store, stored_choice
@@ -300,33 +299,24 @@ def test_pairs_that_were_not_compared_have_errors_that_hold(threads: Client, sto
         assert (found["error_part"].sel(part="truncation").values > 0).all()
 
 
-def product_of_squares(height: float) -> float:
-    """Return the inner product of order -1 of parallel unit squares, in polar coordinates of what parts two points."""
-
-    def density(angle: float, radius: float) -> float:
-        distance = np.hypot(radius, height)
-        overlap = max(1 - radius * np.cos(angle), 0.0) * max(1 - radius * np.sin(angle), 0.0)
-        return float(4 * np.pi * overlap * np.exp(-2 * np.pi * distance) * radius / max(distance, 1e-12))
-
-    return float(dblquad(density, 0, np.sqrt(2), 0, np.pi / 2, epsabs=1e-6)[0])
-
-
 @pytest.mark.slow
 def test_layers_may_be_less_far_apart_beyond_the_octaves(threads: Client, tmp_path: Path) -> None:
-    """At the last frequencies the energy is above the sum of both own ones, and next it falls below it."""
-    heights = {"one": 0.5, "low": 0.0, "high": 0.1}
-    square, faces = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), np.array([[0, 1, 2], [1, 3, 2]])
-    for name, height in heights.items():
-        sb.write_mesh(sb.Mesh(square + np.array([0, 0, height]), faces), tmp_path / f"{name}.ply")
+    """At the last frequencies the energy of what differs is above its limit, and next it falls below it."""
+    orders, base = [-0.65, -1.0, -1.5], Rectangles.sheets(1, 0.0, -0.7)
+    parts = {f"{name}_{height:g}": Rectangles.sheets(1, 0.0, height) for name in "ab" for height in (0.0, 0.1, 0.215)}
+    parts = {name: part.joined(base) if name.startswith("b") else part for name, part in parts.items()}
+    for name, part in {"base": base, **parts}.items():
+        sb.write_mesh(part.mesh(), tmp_path / f"{name}.ply")
     table = small_table(
         lattice={"xi_max": 4.0, "M": 32, "octaves": 1},
-        norm={"orders": [-1.0]},
+        norm={"orders": orders},
         scaling={"mode": "none"},
-        reference={"source": "files", "paths": ["one.ply"]},
-        family=[{"name": "layer", "source": "files", "paths": ["low.ply", "high.ply"]}],
+        reference={"source": "files", "paths": ["base.ply"]},
+        family=[{"name": "layer", "source": "files", "paths": [f"{name}.ply" for name in parts]}],
     )
     sb.run(sb.Study.from_table(table, folder=tmp_path), tmp_path / "store.zarr", threads)
-    pairs = sb.open_store(tmp_path / "store.zarr")["distances"].to_dataset().squeeze("order")
-    found = pairs.sel(mesh="layer/low", other="layer/high")
-    true = np.sqrt(2 * product_of_squares(0.0) - 2 * product_of_squares(heights["high"]))
-    assert abs(found["distance"].item() - true) <= found["error"].item()
+    pairs = sb.open_store(tmp_path / "store.zarr")["distances"].to_dataset()
+    for one, other in combinations(parts, 2):
+        found = pairs.sel(mesh=f"layer/{one}", other=f"layer/{other}")
+        off = np.abs(found["distance"].values - parts[one].distance(parts[other], orders))
+        assert (off <= found["error"].values).all(), (one, other)
