@@ -75,14 +75,16 @@ def _by_meshlab(mesh: sb.Mesh, name: str, **options: object) -> sb.Mesh:
 
 def mmg(mesh: sb.Mesh, triangles: int) -> sb.Mesh:
     """Adapt edges to one length and to the surface, with Mmg."""
+    import meshio
+
     size = float(np.ptp(mesh.vertices, axis=0).max())
     with tempfile.TemporaryDirectory() as folder:
         given, made = Path(folder, "given.mesh"), Path(folder, "made.mesh")
-        sb.write_mesh(mesh, given)
+        meshio.write(given, meshio.Mesh(np.array(mesh.vertices), [("triangle", np.array(mesh.triangles))]))
         # It tells folds from creases by their angle, as above.
         options = ["-hsiz", str(edge_length(mesh, triangles)), "-hausd", str(0.05 * size), "-nr", "-v", "0"]
         subprocess.run(["mmgs_O3", "-in", given, "-out", made, *options], check=True)
-        return sb.read_mesh(made)
+        return sb.as_mesh(meshio.read(made))
 
 
 def gmsh_frontal(mesh: sb.Mesh, triangles: int) -> sb.Mesh:

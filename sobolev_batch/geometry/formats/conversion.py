@@ -6,12 +6,12 @@ Libraries are known by the names of their classes, and none is imported.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError, MeshError, naming
 from sobolev_batch.geometry.closed_forms import Sphere
@@ -28,8 +28,13 @@ T = TypeVar("T")
 # A further kind has a class in `transform/kinds` too.
 SURFACE_KINDS = (Mesh, Sphere, Smooth)
 
-_EXPECTED = "a Mesh, the path of a mesh file, a pair (vertices, triangles) of arrays, or a mesh of trimesh or PyVista"
+_EXPECTED = (
+    "a Mesh, the path of a mesh file, a pair (vertices, triangles) of arrays, or a mesh of trimesh, PyVista, meshio or "
+    "Open3D"
+)
 _SMOOTH = "a parametrised surface (Ellipsoid, Torus, ParametrisedSurface)"
+# Cells of meshio with flat faces, and those without area.
+_FACES, _WITHOUT_AREA = ("triangle", "quad", "polygon"), ("vertex", "line", "line3")
 
 
 def as_mesh(mesh: MeshLike) -> Mesh:
@@ -41,7 +46,10 @@ def as_mesh(mesh: MeshLike) -> Mesh:
     - the path of a mesh file, as text or `pathlib.Path`: see `read_mesh`;
     - a pair (vertices, triangles) of arrays, (n, 3) and (m, 3);
     - a ``trimesh.Trimesh``, or a ``trimesh.Scene`` of one mesh, which is placed as in the scene;
-    - a ``pyvista.PolyData`` without strips.
+    - a ``pyvista.PolyData`` without strips;
+    - a ``meshio.Mesh`` with cells of the types "triangle", "quad" and "polygon"; its vertices and lines have no area
+      and are left out;
+    - an ``open3d.geometry.TriangleMesh`` or ``open3d.t.geometry.TriangleMesh``.
 
     Coordinates become float64, and are copied. Polygons are cut into triangles as in files: see `read_mesh`. Vertices
     stay as they are: none are merged, moved or left out. For the way back there are `Mesh.to_trimesh` and
@@ -115,17 +123,40 @@ def _of_scene(found: Any) -> Mesh:
 def _of_pyvista(found: Any) -> Mesh:
     if found.n_strips:
         raise InputError("it has strips of triangles; pass mesh.triangulate()")
-    if found.is_all_triangles:
-        return Mesh(found.points, found.regular_faces)
-    if not (faces := found.irregular_faces):
+    return _of_faces(found.points, [found.regular_faces] if found.is_all_triangles else found.irregular_faces)
+
+
+def _of_meshio(found: Any) -> Mesh:
+    others = {cells.type for cells in found.cells} - {*_FACES, *_WITHOUT_AREA}
+    if others:
+        raise InputError(f"it has cells of the type {', '.join(sorted(others))}, expected triangles and polygons alone")
+    return _of_faces(found.points, [cells.data for cells in found.cells if cells.type in _FACES and len(cells.data)])
+
+
+def _of_faces(vertices: NDArray[Any], faces: Sequence[NDArray[Any]]) -> Mesh:
+    """Return the mesh of polygons, each array of which has one (k,) or several of as many corners (n, k)."""
+    if not faces:
         raise MeshError("the mesh has no triangles")
+    if vertices.shape[1:] != (3,):
+        raise MeshError(f"the vertices have the shape {vertices.shape}, expected (n, 3)")
+    sizes = np.concatenate([np.full(one.size // one.shape[-1], one.shape[-1]) for one in faces])
     # Numbers that overflow become infinite, which the mesh refuses.
     with np.errstate(all="ignore"):
-        return Mesh(*cut_polygons(found.points, np.concatenate(faces), np.array([*map(len, faces)])))
+        return Mesh(*cut_polygons(vertices, np.concatenate([one.ravel() for one in faces]), sizes))
+
+
+def _of_open3d(found: Any) -> Mesh:
+    if not hasattr(found, "vertex"):
+        return Mesh(np.asarray(found.vertices), np.asarray(found.triangles))
+    if "indices" not in found.triangle:
+        raise MeshError("the mesh has no triangles")
+    return Mesh(found.vertex["positions"].cpu().numpy(), found.triangle["indices"].cpu().numpy())
 
 
 _LIBRARIES: dict[tuple[str, str], Callable[[Any], Mesh]] = {
     ("trimesh", "Trimesh"): lambda found: Mesh(np.array(found.vertices), np.array(found.faces)),
     ("trimesh", "Scene"): _of_scene,
     ("pyvista", "PolyData"): _of_pyvista,
+    ("meshio", "Mesh"): _of_meshio,
+    ("open3d", "TriangleMesh"): _of_open3d,
 }

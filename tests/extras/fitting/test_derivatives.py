@@ -218,7 +218,7 @@ def test_a_gpu_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((sb.shapes.Sphere(), SPHERE, -2.0), "PyVista; found Sphere"),
+        ((sb.shapes.Sphere(), SPHERE, -2.0), "Open3D; found Sphere"),
         ((sb.shapes.icosphere(0), SPHERE, -0.5), "finite only for orders below -1/2, found -0.5"),
         ((sb.shapes.icosphere(0), "sphere", -2.0), "sphere: no mesh format"),
         ((moved(sb.shapes.icosphere(0), 9, 0, 0), SPHERE, -2.0), "to |coordinate| = 9.8"),

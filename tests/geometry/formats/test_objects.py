@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import meshio
 import numpy as np
 import pytest
 import pyvista
@@ -15,7 +16,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
-from tests.support.shapes import AWKWARD_VERTICES, BOX_TRIANGLES, BOX_VERTICES, box
+from tests.support.shapes import AWKWARD_VERTICES, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES, box
+
+try:
+    import open3d
+except ImportError:
+    open3d = None  # not for every version of Python
+with_open3d = pytest.mark.skipif(open3d is None, reason="Open3D is not installed")
 
 # Vertices in an order of their own, two of them in one place, and one that no triangle uses.
 VERTICES: NDArray[np.float64] = np.vstack([AWKWARD_VERTICES[::-1], AWKWARD_VERTICES[:1], [(9, 9, 9)]])
@@ -40,12 +47,21 @@ MAKERS: dict[str, Callable[[], Any]] = {
     "trimesh scene": scene,
     # A class of somebody's own.
     "sub class": lambda: type("Sub", (trimesh.Trimesh,), {})(VERTICES, TRIANGLES, process=False),
+    "meshio": lambda: meshio.Mesh(
+        VERTICES, [("line", [[0, 1]]), ("triangle", TRIANGLES[:5]), ("triangle", TRIANGLES[5:])]
+    ),
     "to_trimesh": lambda: original().to_trimesh(),
     "to_pyvista": lambda: original().to_pyvista(),
+    "open3d": lambda: open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(VERTICES), open3d.utility.Vector3iVector(TRIANGLES.astype(np.int32))
+    ),
+    "open3d tensors": lambda: open3d.t.geometry.TriangleMesh(
+        open3d.core.Tensor(VERTICES), open3d.core.Tensor(TRIANGLES)
+    ),
 }
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=with_open3d if "open3d" in name else ()) for name in MAKERS])
 def test_meshes_of_other_libraries_stay_as_they_are(name: str) -> None:
     assert sb.as_mesh(MAKERS[name]()).digest == original().digest
 
@@ -53,10 +69,18 @@ def test_meshes_of_other_libraries_stay_as_they_are(name: str) -> None:
 # A square, a triangle, an arrow and an L with their areas; a cut from the first corner would make the last two larger.
 CORNERS = np.array([(0, 0, 0), (0, 2, 0), (2, 2, 0), (2, 0, 0), (0.5, 1.5, 0), (2, 1, 0), (1, 1, 0), (1, 0, 0)])
 FACES = {(0, 1, 2, 3): 4.0, (0, 1, 3): 2.0, (0, 1, 2, 4): 1.0, (2, 5, 6, 7, 0, 1): 3.0}
+POLYGONS: dict[str, Callable[[], Any]] = {
+    "pyvista": lambda: pyvista.PolyData(CORNERS, np.concatenate([[len(face), *face] for face in FACES])),
+    "meshio": lambda: meshio.Mesh(
+        CORNERS,
+        [({3: "triangle", 4: "quad"}.get(len(face), "polygon"), [face]) for face in FACES] + [("quad", [])],
+    ),
+}
 
 
-def test_polygons_of_pyvista_are_cut_as_in_files() -> None:
-    mesh = sb.as_mesh(pyvista.PolyData(CORNERS, np.concatenate([[len(face), *face] for face in FACES])))
+@pytest.mark.parametrize("library", POLYGONS)
+def test_polygons_of_other_libraries_are_cut_as_in_files(library: str) -> None:
+    mesh = sb.as_mesh(POLYGONS[library]())
     assert mesh.areas.sum() == pytest.approx(sum(FACES.values()))
     assert mesh.notes == ()
     assert sb.as_mesh(pyvista.Box(quads=True)).area == pytest.approx(24.0)
@@ -81,12 +105,16 @@ def two_parts() -> Any:
 
 
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
-    "number": (lambda: 7, "expected a Mesh, the path of a mesh file, a pair .* or PyVista; found int"),
+    "number": (lambda: 7, "expected a Mesh, the path of a mesh file, a pair .* or Open3D; found int"),
     "three": (lambda: (1, 2, 3), "found tuple"),
     "strips": (lambda: pyvista.Sphere().strip(), r"PolyData is no mesh .* strips of triangles; .*mesh\.triangulate"),
     "no faces": (lambda: pyvista.PolyData(BOX_VERTICES), r"the pyvista\.PolyData is no mesh .*no triangles"),
     "grid": (lambda: box().to_pyvista().cast_to_unstructured_grid(), "found pyvista.UnstructuredGrid"),
-    "infinite": (lambda: pyvista.PolyData(BOX_VERTICES + np.inf, [4, 0, 1, 2, 3]), "NaN or infinite coordinates"),
+    "tetrahedra": (lambda: meshio.Mesh(BOX_VERTICES, [("tetra", [[0, 1, 2, 4]])]), "cells of the type tetra"),
+    "flat": (lambda: meshio.Mesh(BOX_VERTICES[:, :2], [("quad", BOX_QUADS)]), r"shape \(8, 2\), expected \(n, 3\)"),
+    "outside": (lambda: meshio.Mesh(BOX_VERTICES, [("quad", [[0, 1, 2, 8]])]), r"face 1 has an index outside 0\.\.7"),
+    "infinite": (lambda: meshio.Mesh(BOX_VERTICES + np.inf, [("quad", BOX_QUADS)]), "NaN or infinite coordinates"),
+    "no cells": (lambda: meshio.Mesh(BOX_VERTICES, [("line", [[0, 1]])]), "the mesh has no triangles"),
     "two parts": (two_parts, r"it holds 2 parts, .* as scene\.to_mesh\(\)"),
 }
 
@@ -131,7 +159,7 @@ def test_every_function_takes_paths_and_meshes_of_other_libraries(
     path = tmp_path / "ball.off"
     sb.write_mesh(larger.to_trimesh(), path)
     expected = USES[name](larger, target)
-    for given in (path, larger.to_trimesh()):
+    for given in (path, meshio.Mesh(larger.vertices, [("triangle", larger.triangles)])):
         assert USES[name](given, target) == pytest.approx(expected, rel=1e-9)
 
 
