@@ -23,7 +23,7 @@ from sobolev_batch.tables.evaluator import Evaluator
 from sobolev_batch.tables.stored_spectra import read_spectra
 
 # Raise it whenever the same fields lead to other distances: tiles of older versions are then made again.
-_TILES_VERSION = 5
+_TILES_VERSION = 6
 # Meshes along a side of a tile: with fewer, small studies keep their workers busy; with more, there are fewer keys.
 _FEWEST, _MOST, _TILES_OF_A_ROW = 32, 512, 8
 # Arrays of the distances and their errors, as `NormEstimate.named` names them.

@@ -177,8 +177,8 @@ SENTENCES = [
     ("lattice", {"xi_max": 5.0}, "[lattice]: M is missing"),
     ("norm", [-2.0], "[norm] must be a table, found [-2.0]"),
     ("scaling.length_unit", "mm", "[scaling]: length_unit is unknown; known are mode, scale, origin"),
-    ("units", "mm", "units is unknown; known are mesh, reference, family, scaling, study, lattice, accuracy, norm, compare, "
-     "transform, proximity, object, objects"),
+    ("units", "mm", "units is unknown; known are mesh, reference, family, scaling, study, lattice, accuracy, norm, "
+     "compare, transform, proximity, object, objects"),
     ("accurracy", {}, "[accurracy] is unknown; did you mean accuracy?"),
     ("accuracy", {"rtol": 0.1}, "either a [lattice] or an [accuracy] is needed, and not both"),
     ("transform.quadrature", 1.5, "[transform]: quadrature must be text in quotes or a whole number, found 1.5"),
