@@ -231,10 +231,10 @@ class Store:
     @property
     def reference(self) -> int:
         """Row of the reference."""
-        labels, reference = self.labels(), self.attributes()["study"]["reference"]
-        if reference not in labels:
+        places = {label: row for row, label in enumerate(self.labels())}
+        if (reference := self.attributes()["study"]["reference"]) not in places:
             raise self.damage(ROOT, f"it has no mesh {reference!r}, which is its reference")
-        return labels.index(reference)
+        return places[reference]
 
     def names_of_rows(self, count: int) -> Sequence[str]:
         """Return what messages call rows: their labels, or their numbers where labels are damaged."""
