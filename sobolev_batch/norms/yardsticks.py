@@ -94,10 +94,10 @@ def yardsticks(
             values_errors = np.maximum(_VALUES_ACCURACY * np.maximum(distances, errors), _ROUNDING * b.area)
             target = ErrorTarget(orders, tuple(values_errors.tolist()))
             values = frequencies.values(b, target, Execution(threads=available_cores()))
-        _, radius = b.bounding_sphere
+        (_, radius), moved = b.bounding_sphere, frequencies.moved(values, b)
         for i in resolved.tolist():
             columns["moved"][i], columns["moved_error"][i] = _as_far(
-                lambda amount: frequencies.moved(values, b, amount * radius), i, estimate, float(relative[i])
+                lambda amount: moved(amount * radius), i, estimate, float(relative[i])
             )
     return found.assign(labelled(order, columns, {}).data_vars)
 

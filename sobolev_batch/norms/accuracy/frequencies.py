@@ -1,6 +1,6 @@
 """Frequencies at which surfaces are compared, with the norms and products that follow from values there."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self, cast
@@ -87,28 +87,32 @@ class Frequencies:
         measure = Measure.from_values(values, signs)
         return self.norms_of(measure, surfaces, self.errors(values), self.tail(measure, surfaces, signs))
 
-    def moved(self, values: SurfaceValues, surface: Surface, length: float) -> NormEstimate:
-        """Return the distance (orders,) of a surface to itself moved by a length: the rms over all directions.
+    def moved(self, values: SurfaceValues, surface: Surface) -> Callable[[float], NormEstimate]:
+        """Return a function of the distance (orders,) of a surface to itself moved by a length: the rms of directions.
 
         Its errors are what a lattice without a tail leaves out. Others are alike for all that these values are part of.
         """
-        # ∫ |1 - exp(-2πi ξ·v)|² over directions of v, on average: 2 - 2 sin(2π|ξ||v|)/(2π|ξ||v|).
         own = Measure.from_values([values], [1])
         radii = self.lattice.spacing * np.sqrt(np.arange(self.lattice.shell_count))
         shells = shell_sums(own.lattice, None, self.lattice, self.lattice.half)
-        shells *= 2 - 2 * np.sinc(2 * radii * length)
-        none = np.zeros(len(self.orders))
-        if not self.has_tail:
-            support = Support(2 * support_of([surface]).areas, self.widths)
-            return estimate_norms(sums_of_shells(shells, self.weights), self.weights, support, none)
-        squares = self.weights.per_shell @ shells
-        for weights, octave in zip(self._octave_weights, own.octaves, strict=True):
-            factors = 2 - 2 * np.sinc(2 * weights.sampling.radii * length)
-            squares = squares + weights.by_order[:-1] @ (squared_moduli(octave) * factors)
-        if (tail := self.tail(own, [surface], [1])) is not None:
-            means = np.array([mean_sinc(self._cutoff, order, length) for order in self.orders])
-            squares = squares + (2 - 2 * means) * tail.remainder
-        return NormEstimate(np.sqrt(np.maximum(squares, 0.0)), none, none, none)
+        energies, tail = [squared_moduli(octave) for octave in own.octaves], self.tail(own, [surface], [1])
+        support, none = Support(2 * support_of([surface]).areas, self.widths), np.zeros(len(self.orders))
+
+        def by(length: float) -> NormEstimate:
+            # ∫ |1 - exp(-2πi ξ·v)|² over directions of v, on average: 2 - 2 sin(2π|ξ||v|)/(2π|ξ||v|).
+            sums = shells * (2 - 2 * np.sinc(2 * radii * length))
+            if not self.has_tail:
+                return estimate_norms(sums_of_shells(sums, self.weights), self.weights, support, none)
+            squares = self.weights.per_shell @ sums
+            for weights, energy in zip(self._octave_weights, energies, strict=True):
+                factors = 2 - 2 * np.sinc(2 * weights.sampling.radii * length)
+                squares = squares + weights.by_order[:-1] @ (energy * factors)
+            if tail is not None:
+                means = np.array([mean_sinc(self._cutoff, order, length) for order in self.orders])
+                squares = squares + (2 - 2 * means) * tail.remainder
+            return NormEstimate(np.sqrt(np.maximum(squares, 0.0)), none, none, none)
+
+        return by
 
     def errors(self, values: Sequence[SurfaceValues]) -> Reals:
         """Return the norms of the own errors (orders,) of all values together."""
