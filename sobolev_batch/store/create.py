@@ -88,9 +88,9 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     """
     store = Store(location)
     try:
-        if not store.exists():
+        if not (exists := store.exists()):
             store.location.require_free(besides=LOCK_KEYS)
-        if not store.exists() or store.is_unfinished:
+        if not exists or store.is_unfinished:
             _create(store, plan)
             return store
         attributes, lattice = store.attributes(), _lattice_entry(plan)
