@@ -83,14 +83,14 @@ Hashes = dict[str, tuple[str, str]]
 Metadata = tuple[dict[str, Document], Hashes]
 # Tasks write into the chunks of these groups; all others are tables, written, listed and hidden as a whole.
 GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, SPECTRA_GROUP, RECORDS)
-# What is read of the attribute "study" of every root, and besides of that of one object, and of several.
-_TABLE = create_model("_TABLE", study=(dict[str, Any], ...))
-_OF_ANY = create_model("_OF_ANY", name=(str, ...), orders=(list[float], ...), table=(_TABLE, ...))
-_LATTICE = create_model("_LATTICE", xi_max=(float, ...), M=(int, ...))
+# Readers need these entries of the attribute "study" of every root, and more of that of one object, and of several.
+_TABLE = create_model("Table", study=(dict[str, Any], ...))
+_OF_ANY = create_model("OfAny", name=(str, ...), orders=(list[float], ...), table=(_TABLE, ...))
+_LATTICE = create_model("Lattice", xi_max=(float, ...), M=(int, ...))
 _OF_ONE = create_model(
-    "_OF_ONE", __base__=_OF_ANY, lattice=(_LATTICE, ...), dtype=(ComplexDtype, ...), reference=(str, ...)
+    "OfOne", __base__=_OF_ANY, lattice=(_LATTICE, ...), dtype=(ComplexDtype, ...), reference=(str, ...)
 )
-_OF_OBJECTS = create_model("_OF_OBJECTS", __base__=_OF_ANY, objects=(list[str], ...))
+_OF_OBJECTS = create_model("OfObjects", __base__=_OF_ANY, objects=(list[str], ...))
 
 
 class Store:

@@ -25,7 +25,7 @@ from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips, unpacke
 from sobolev_batch.geometry.mesh import merge_coincident
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-# Of indices, so that negative ones, which count from the end, are as wrong as those beyond it.
+# Indices have no sign: negative ones, which would count from the end, are as wrong as those beyond it.
 _INDEX = np.uint32
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Modes of primitives: points and lines have none of the area; triangles, strips and fans of them follow.
