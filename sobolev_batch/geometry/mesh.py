@@ -105,8 +105,17 @@ class Mesh:
 
     @property
     def areas(self) -> Reals:
-        """Area of each triangle (m,), in squared units of length."""
+        """Area of each triangle (m,), in squared units of length; zero where it has none to double precision."""
         return self._sizes.areas
+
+    @property
+    def with_area(self) -> Mesh:
+        """The mesh without triangles that have no area to double precision: they are no part of its measure."""
+        return self if not self._sizes.without_area else self._without_flat
+
+    @cached_property
+    def _without_flat(self) -> Mesh:
+        return Mesh.from_checked(self.vertices, np.ascontiguousarray(self.triangles[self.areas > 0]), self.notes)
 
     @cached_property
     def area(self) -> float:
@@ -131,16 +140,16 @@ class Mesh:
 
     @cached_property
     def extent(self) -> Extent:
-        """Extent of the `used_vertices` along `DIRECTIONS`."""
-        return Extent.of_points(self.vertices[self.used_vertices].T)
+        """Extent of the vertices of triangles `with_area` along `DIRECTIONS`."""
+        return Extent.of_points(self.vertices[self.with_area.used_vertices].T)
 
     @property
     def bounding_sphere(self) -> tuple[Point, float]:
-        """Centre of the bounding box, and distance from it to the farthest of the `used_vertices`."""
+        """Centre of the bounding box, and distance from it to the farthest vertex of triangles `with_area`."""
         lower, upper = self.extent.box
         center = lower + (upper - lower) / 2
         x, y, z = center.tolist()
-        return (x, y, z), float(np.linalg.norm(self.vertices[self.used_vertices] - center, axis=1).max())
+        return (x, y, z), float(np.linalg.norm(self.vertices[self.with_area.used_vertices] - center, axis=1).max())
 
     def moved(self, scale: float, origin: Point, turn: Reals | None = None) -> Mesh:
         """Return the mesh after x -> scale * turn (x - origin), where a turn (3, 3) is a rotation."""
@@ -170,7 +179,7 @@ class Mesh:
         """
         with np.errstate(over="ignore"):
             single = bool(np.all(self.vertices.astype(np.float32) == self.vertices))
-        return _SINGLE_ROUNDING * float(np.abs(self.vertices).max()) if single else 0.0
+        return _SINGLE_ROUNDING * self.extent.reach if single else 0.0
 
     @cached_property
     def used_vertices(self) -> Indices:
@@ -353,7 +362,9 @@ class Mesh:
                 twice_areas, thrice_radii, *sides = np.sqrt(squares, out=squares)
                 areas[batch], radii[batch] = twice_areas / 2, thrice_radii / 3
                 longest_sides = np.maximum.reduce(sides)
-                without_area += int(np.count_nonzero(areas[batch] <= _AREA_RESOLUTION * longest_sides**2))
+                is_flat = areas[batch] <= _AREA_RESOLUTION * longest_sides**2
+                areas[batch][is_flat] = 0.0
+                without_area += int(np.count_nonzero(is_flat))
                 total, longest = total + float(squares[2:].sum()), max(longest, float(longest_sides.max()))
         return _Sizes(_frozen(areas), _frozen(radii), total / (3 * len(areas)), longest, without_area)
 

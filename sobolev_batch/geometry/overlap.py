@@ -8,6 +8,7 @@ than it divides the area, as between combs.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
@@ -28,6 +29,8 @@ _GRID, _LEAST_HEIGHT = 0.25, 2.0
 # How far off areas may be, relative to them, and the least fraction of them that is worth taking out.
 _BALANCE, _LEAST_FRACTION = 1e-12, 0.05
 _MOST_LAYERS = 16
+# Triangles in a plane from which on it takes less time to look first whether they share whole edges.
+_MANY = 64
 # Triangles that are measured at a time, and the most pairs of a small one and a plane, which may be tilted so far.
 _BATCH, _MOST_PAIRS, _LEAST_COSINE = 1 << 14, 1 << 23, 1 - 2e-8
 # A direction without pattern, to whose side normals are turned, and a projection of normals and offsets.
@@ -236,7 +239,7 @@ def _cut_together(sides: Sequence[_Side], of: list[Indices], planes: Reals, numb
         lifted += (planes[row, 3:] * normals[row])[:, None]
         _, areas, heights = _measured(lifted)
         is_thick = heights > _LEAST_HEIGHT * rounding
-        kept = np.bincount(row, areas * is_thick, count)
+        kept = _sums(row, areas * is_thick, count)
         off = np.maximum(off, np.maximum(np.abs(sheet.areas - whole), np.abs(kept - uncovered)))
         old, new = old + np.bincount(sheet.plane, minlength=count), new + np.bincount(row, is_thick, count)
         corners.append(lifted[is_thick])
@@ -275,11 +278,17 @@ class _Sheet:
         which = which[np.argsort(of[which], kind="stable")]
         plane, corners, count = of[which], side.corners(which), len(planes)
         polygons = shapely.polygons(corners @ frames[plane].transpose(0, 2, 1))
-        areas = np.asarray(np.bincount(plane, shapely.area(polygons), count), dtype=np.float64)
+        areas = _sums(plane, shapely.area(polygons), count)
         gaps = np.zeros(count)
         np.maximum.at(gaps, plane, _heights_above(corners, planes[plane]))
-        unions = shapely.union_all(shapely.multipolygons(polygons, indices=plane)[:, None], axis=1)
-        of_planes = np.split(polygons, np.cumsum(np.bincount(plane, minlength=count))[:-1])
+        counts, sets = np.bincount(plane, minlength=count), shapely.multipolygons(polygons, indices=plane)
+        of_planes = np.split(polygons, np.cumsum(counts)[:-1])
+        for row in np.flatnonzero(counts > _MANY).tolist():
+            with suppress(GEOSException):
+                # It takes a sixth of the time, and holds where triangles share whole edges and do not overlap.
+                merged = shapely.coverage_union_all(of_planes[row])
+                sets[row] = merged if merged.is_valid else sets[row]
+        unions = shapely.union_all(sets[:, None], axis=1)
         covered_often = np.flatnonzero(np.abs(shapely.area(unions) - areas) > _BALANCE * areas).tolist()
         stacks = {row: _stack(of_planes[row], float(_BALANCE * areas[row]), grid) for row in covered_often}
         layers = np.full((count, max([1, *map(len, stacks.values())])), shapely.Polygon(), dtype=object)
@@ -287,6 +296,13 @@ class _Sheet:
         for row, stack in stacks.items():
             layers[row, : len(stack)] = stack
         return cls(plane, areas, gaps, layers)
+
+
+def _sums(rows: Indices, values: Reals, count: int) -> Reals:
+    """Return the sums (count,) of values by rows in ascending order: one by one, 200,000 like ones lose 4e-12."""
+    starts, sums = np.flatnonzero(np.diff(rows, prepend=-1)), np.zeros(count)
+    sums[rows[starts]] = np.add.reduceat(values, starts)
+    return sums
 
 
 def _stack(polygons: _Objects, slack: float, grid: float) -> list[Any]:

@@ -232,7 +232,7 @@ def kind_of(surface: object, *of_points: Any) -> SurfaceKind:
     """Return a surface as transforms see it, with some `of_points`; InputError where it is of no known kind."""
     for surface_type, kind in _KINDS.items():
         if isinstance(surface, surface_type):
-            return kind(surface, *of_points)
+            return kind(surface.with_area if isinstance(surface, Mesh) else surface, *of_points)
     raise InputError(
         "a surface must be a Mesh, a Sphere or a parametrised surface (Ellipsoid, Torus, ParametrisedSurface), "
         f"found {type(surface).__name__}"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import Mesh
+from sobolev_batch import Lattice, Mesh, distance, fourier_transform
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.overlap import shared_triangles
@@ -187,6 +187,26 @@ def test_what_counts_as_zero_area_does_not_depend_on_the_unit(scale: float) -> N
     mesh = Mesh(scale * np.array(needle + flat), [[0, 1, 2], [3, 4, 5]])
     assert mesh.counts["zero_area_triangles"] == 1
     assert mesh.areas[0] == pytest.approx(0.5e-13 * scale**2)
+
+
+@pytest.mark.parametrize("far", [[50.0, 0.0, 0.0], [3e3, 1e3, -7e2]])
+def test_triangles_without_area_have_no_part_in_sizes_and_numbers(far: list[float]) -> None:
+    ball = icosphere(1)
+    corners, count = np.concatenate([ball.vertices, [far], [np.array(far) / 3]]), len(ball.vertices)
+    # A repeated vertex, and three on a line that rounding gives an area.
+    mesh = Mesh(corners, [*ball.triangles, [0, 0, count], [count, count + 1, count]])
+    line = Mesh(
+        np.concatenate([ball.vertices, np.outer([0.1, 0.7, 1.0], far) + 0.1]),
+        [*ball.triangles, [count, count + 1, count + 2]],
+    )
+    for one in (mesh, line):
+        assert one.extent == ball.extent
+        assert one.bounding_sphere == ball.bounding_sphere
+        assert one.area == ball.area
+        assert one.rounding == ball.rounding
+        found, expected = (fourier_transform(each, Lattice(3.0, 16)) for each in (one, ball))
+        np.testing.assert_allclose(found, expected, atol=1e-9 * ball.area)
+        assert (distance(one, ball, rtol=1e-2)["distance"] == 0.0).item()
 
 
 def test_areas_and_lengths_of_solids() -> None:

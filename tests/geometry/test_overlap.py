@@ -80,6 +80,18 @@ def moved(mesh: Mesh, seed: int) -> Mesh:
     return Mesh(mesh.vertices @ turn + rng.normal(size=3), mesh.triangles)
 
 
+def test_a_face_of_very_many_triangles_is_taken_out() -> None:
+    # One by one, so many equal areas add up to 4e-12 too much.
+    count = 289
+    places, (i, j) = np.linspace(0, 1, count + 1), np.divmod(np.arange(count**2), count)
+    first = i * (count + 1) + j
+    triangles = np.concatenate(
+        [np.c_[first, first + count + 1, first + 1], np.c_[first + 1 + count, first + count + 2, first + 1]]
+    )
+    grid = np.stack(np.meshgrid(places, places, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    assert rests_of(Mesh(grid, triangles), square(1.0)).meshes == (None, None)
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_what_an_edit_left_as_it_was_is_taken_out(seed: int) -> None:
     pair = edited(np.random.default_rng(seed))

@@ -151,8 +151,8 @@ class SurfaceSize:
     def from_surface(cls, surface: Surface) -> Self:
         """Return the size of a surface."""
         kind, extent = kind_of(surface), surface.area
-        if isinstance(surface, Mesh):
-            extent = _EQUILATERAL * float(np.square(surface.centroid_radii).sum())
+        if isinstance(kind.surface, Mesh):
+            extent = _EQUILATERAL * float(np.square(kind.surface.centroid_radii).sum())
         return cls(kind.triangles, extent, kind.is_closed_form)
 
     @property
