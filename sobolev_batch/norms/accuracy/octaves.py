@@ -305,7 +305,9 @@ def farther_out(state: State) -> State | None:
     # The nodes of surfaces by formula resolve no more.
     highest = np.sqrt(_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * smooth)) if smooth else np.inf
     can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= highest
-    points = int(_MORE_POINTS * beyond.points * state.excess**2)
+    # What points may have missed falls with their number, and what they scatter with its root.
+    scattered, missed = (1 - beyond.hidden) * state.excess**2 / 2, beyond.hidden * state.excess**2
+    points = int(_MORE_POINTS * beyond.points * (scattered + np.sqrt(scattered**2 + missed)))
     if beyond.hidden > MOSTLY:
         # Nothing is hidden from this many.
         points = min(points, beyond.covering)

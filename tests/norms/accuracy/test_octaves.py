@@ -153,6 +153,23 @@ def test_points_that_see_less_than_is_there_already_are_no_accuracy(monkeypatch:
         distance(MOVED_BOX[0].mesh(), MOVED_BOX[1].mesh(), -1.0, rtol=0.1)
 
 
+def test_no_more_points_are_drawn_than_a_part_that_they_may_miss_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def hiding(surfaces: Any, signs: Any, cutoff: float, orders: Any, points: int | None, **options: Any) -> Remainder:
+        """Return an error that falls with the number of points; at first there are few."""
+        asked.append(points or 20)
+        beyond = remainder(surfaces, signs, cutoff, orders, **options)
+        errors = (20 * beyond.energies[0] / asked[-1],)
+        return replace(beyond, errors=errors, points=asked[-1], pairs=asked[-1], covering=10**6, hidden=1.0)
+
+    monkeypatch.setattr(problem, "remainder", hiding)
+    found = distance(MOVED_BOX[0].mesh(), MOVED_BOX[1].mesh(), -1.0, rtol=0.02)
+    assert found["within"]
+    # Far fewer would not do.
+    assert found["error_part"].sel(part="truncation") > 0.05 * 0.02 * found["distance"]
+
+
 @pytest.mark.parametrize("is_chance", [True, False])
 def test_other_points_confirm_a_disagreement_or_show_that_it_was_chance(
     monkeypatch: pytest.MonkeyPatch, is_chance: bool
