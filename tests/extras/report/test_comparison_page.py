@@ -5,17 +5,19 @@ from __future__ import annotations
 import base64
 import json
 import re
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 import sobolev_batch as sb
 from tests.support.browser import browser
 from tests.support.commands import call
 
-NAME = "out <b>&$^$.off"
+NAME = "scan 7 of part C <b>&$^$.off"
 
 
 def made_page(folder: Path, *options: str, status: int = 0) -> Path:
@@ -74,6 +76,24 @@ def test_meshes_without_sides_have_distances_without_signs(tmp_path: Path) -> No
     data = data_of(tmp_path / "page.html")
     assert data["pair"]["signed"] is False
     assert min(data["histogram"]["x"]) > 0
+
+
+@pytest.mark.all
+def test_places_beyond_the_colours_have_the_last_colour(tmp_path: Path) -> None:
+    ball = sb.shapes.icosphere(4)
+    # A hill whose sides are steep, so that all of it but a rim is farther away than a hundredth of its height.
+    hill = np.clip(3 * (ball.vertices[:, 0] - 0.6), 0.0, 0.5)
+    sb.write_mesh(sb.Mesh(ball.vertices * (1 + hill[:, None]), ball.triangles), tmp_path / "hill.off")
+    sb.write_mesh(ball, tmp_path / "ball.off")
+    arguments = ("hill.off", "ball.off", "--within", "0.005", "--report", "page.html")
+    assert call("compare", *arguments, folder=tmp_path).returncode == 1
+    with browser(tmp_path / "profile") as reader:
+        reader.open_report(tmp_path / "page.html")
+        chart = reader.driver.find_element("id", "chart-pair").screenshot_as_png
+    # The ball, left of the colours: all of what is inside of the hill, but for its rim, is as blue as the farthest.
+    pixels = np.hsplit(imread(BytesIO(chart))[:, :-65], 2)[1]
+    red, blue = pixels[..., 0], pixels[..., 2]
+    assert np.mean(red[blue - red > 0.1] < 0.3) > 0.9
 
 
 @pytest.mark.all

@@ -1,10 +1,10 @@
 "use strict";
 // Charts of a report, drawn by plotly.js from the page's data in the colours of its style sheet.
 (async () => {
+  const bytes = (text) => Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
   // The page holds plotly.js compressed: it would be most of it. Without it, a note stands for the charts.
   const unpacked = async (text) => {
-    const bytes = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    const stream = new Blob([bytes(text)]).stream().pipeThrough(new DecompressionStream("gzip"));
     return new Response(stream).text();
   };
   try {
@@ -245,9 +245,12 @@
       camera: { eye: { x: 1.1, y: -1.25, z: 0.7 } }, uirevision: "kept",
     };
   };
-  const mesh = ({ label, points: [x, y, z], corners: [i, j, k] }, intensity, [low, high], colorscale) => ({
-    type: "mesh3d", x, y, z, i, j, k, intensity, cmin: low, cmax: high, hoverinfo: "x+y+z+text", colorscale,
-    hovertemplate: `${plain(label).replaceAll("%", "&#37;")}<br>%{intensity:.3g}<extra></extra>`, flatshading: false,
+  const numbers = ({ bdata }) => new Float32Array(bytes(bdata).buffer);
+  // Where values far beyond the colours vary fast, WebGL would draw the mean of all colours: they are cut.
+  const mesh = ({ label, points: [x, y, z], corners: [i, j, k] }, values, [low, high], colorscale) => ({
+    type: "mesh3d", x, y, z, i, j, k, cmin: low, cmax: high, hoverinfo: "x+y+z+text", colorscale, flatshading: false,
+    customdata: numbers(values), intensity: numbers(values).map((one) => Math.min(Math.max(one, low), high)),
+    hovertemplate: `${plain(label).replaceAll("%", "&#37;")}<br>%{customdata:.3g}<extra></extra>`,
     lighting: { ambient: 0.8, diffuse: 0.45, specular: 0.08, roughness: 0.8 },
     colorbar: { outlinewidth: 0, thickness: 12, exponentformat: "power", len: 0.8,
       ...(narrow() ? { orientation: "h", y: -0.05, yanchor: "top" } : {}) },
@@ -273,7 +276,7 @@
   const pair = () => {
     const { views, place: [x, y, z], eye, limit, signed } = data.pair;
     const place = document.getElementById("chart-pair");
-    const [height, beside] = [isPrinted() ? 210 : narrow() ? 640 : 440, !narrow() || isPrinted()];
+    const [height, beside] = [isPrinted() ? 195 : narrow() ? 640 : 440, !narrow() || isPrinted()];
     const width = isPrinted() ? 640 : place.clientWidth;
     const colors = signed ? diverging() : [[0, color("neutral")], [1, color("more")]];
     const traces = views.flatMap((view, i) => {
@@ -304,11 +307,12 @@
     }
   };
 
+  // Red and blue are outside and inside here, and no meshes.
   const histogram = () => {
     const { x, shares } = data.histogram;
     const traces = shares.map((share, i) => ({
       type: "scatter", mode: "lines", name: short(data.families[i], 24), x, y: share.map((one) => one || null),
-      line: { color: series(data.families[i]), width: 1.8, shape: "hvh" }, hoverinfo: "x+y",
+      line: { color: color(`series-${2 + 3 * i}`), width: 1.8, shape: "hvh" }, hoverinfo: "x+y",
     }));
     draw("histogram", traces, {
       xaxis: { exponentformat: "power", nticks: 6 }, yaxis: { type: "log", tickformat: ".2~%", dtick: 1 },
