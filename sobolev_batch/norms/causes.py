@@ -84,22 +84,23 @@ def spectrum(
     orders = check_orders(order)
     if not isinstance(similarity, Similarity | None):
         raise InputError(f"similarity must be a Similarity, found {similarity!r}")
-    first, second = (field_of(a, lattice, orders), None) if b is None else pair_of(a, b, lattice, orders)
-    lattice = Lattice.from_field(first)
+    fields = [field_of(a, lattice, orders)] if b is None else [*pair_of(a, b, lattice, orders)]
+    lattice = Lattice.from_field(fields[0])
     edges = _edges(bands, lattice)
-    count = len(edges) - 1
-    sums = shells_of(first, second, lattice)
-    weighted = SobolevWeights(lattice, orders).per_shell * sums
     members = _bands_of_shells(edges, lattice)
-    squared = np.stack([_sums_of_bands(row, members, count) for row in weighted])
-    total = weighted.sum(axis=1)
+
+    def of_bands(values: Reals) -> Reals:
+        return np.asarray(np.bincount(members, values, len(edges) + 1)[1:-1])
+
+    sums = shells_of(fields, lattice)
+    weighted = SobolevWeights(lattice, orders).per_shell * sums
+    squared, total = np.stack([of_bands(row) for row in weighted]), weighted.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = squared / total[:, None]
-        mean = _sums_of_bands(sums, members, count) / _sums_of_bands(shell_volumes(lattice), members, count)
+        mean = of_bands(sums) / of_bands(shell_volumes(lattice))
     lower, upper = edges[:-1], edges[1:]
     surfaces = 4 * np.pi / 3 * (lower**2 + lower * upper + upper**2)
     dims, values, _ = axis = order_axis(order)
-    fields = (first,) if second is None else (first, second)
     return xr.Dataset(
         {
             "squared": ((*dims, "band"), squared.reshape(*values.shape, -1), described("squared value", LENGTH)),
@@ -139,10 +140,6 @@ def _bands_of_shells(edges: Reals, lattice: Lattice) -> NDArray[np.intp]:
     bands = np.searchsorted(edges, radii * (1 + _ON_EDGE), side="right")
     bands[np.abs(radii - edges[-1]) <= _ON_EDGE * edges[-1]] = len(edges) - 1
     return bands
-
-
-def _sums_of_bands(values: Reals, bands: NDArray[np.intp], count: int) -> Reals:
-    return np.asarray(np.bincount(bands, weights=values, minlength=count + 2)[1 : count + 1])
 
 
 def band_coordinates(

@@ -104,7 +104,7 @@ def norm(
     field = field_of(a, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(field), orders)
     near_axes = NearAxes(weights.lattice, 1)
-    sums = shells_of(field, None, weights.lattice, near_axes)
+    sums = shells_of([field], weights.lattice, near_axes)
     estimate = _estimate(weights, sums, [field], images_at(near_axes.images(), orders)[:, 0])
     return labelled(order, estimate.named("norm"), lattice_attributes(weights.lattice, field))
 

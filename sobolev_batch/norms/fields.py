@@ -320,10 +320,10 @@ def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> tuple[
     return sums, near_axes
 
 
-def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice, near_axes: NearAxes | None = None) -> Reals:
-    """Return the shell sums of |a|², or of |a - b|²; where asked, a or a - b near the axes is gathered with them."""
+def shells_of(fields: Sequence[xr.DataArray], lattice: Lattice, near_axes: NearAxes | None = None) -> Reals:
+    """Return the shell sums of a field, or of the difference of two, whose values near the axes may be gathered too."""
     sums = np.zeros(lattice.shell_count)
-    for block, (values, *others) in read_blocks(lattice, *((a,) if b is None else (a, b))):
+    for block, (values, *others) in read_blocks(lattice, *fields):
         difference = values - others[0] if others else values
         sums += shell_sums(difference, None, lattice, block)
         if near_axes is not None:
