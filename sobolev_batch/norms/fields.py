@@ -255,9 +255,7 @@ def field_of(
         if a.dtype.kind != "c":
             raise InputError(f"a Fourier field has complex values, found {a.dtype}")
         if set(a.dims) != set(AXES):
-            raise LatticeError(
-                f"a field must have the dimensions {', '.join(AXES)} and no others, found {a.dims}: select one mesh"
-            )
+            raise LatticeError(f"a field has the dimensions {', '.join(AXES)} alone, found {a.dims}: select one mesh")
         return a
     if lattice is None:
         raise InputError(
@@ -300,11 +298,9 @@ def quality_of(field: xr.DataArray) -> Quality | None:
     return Quality.from_json(text) if text else None
 
 
-def read_blocks(
-    lattice: Lattice, *fields: xr.DataArray, largest: int = BLOCK_SAMPLES
-) -> Iterator[tuple[Block, list[Complexes]]]:
+def read_blocks(lattice: Lattice, *fields: xr.DataArray) -> Iterator[tuple[Block, list[Complexes]]]:
     """Read fields block by block of their half lattice, so that they need not fit into memory."""
-    for block in lattice.half.split(largest):
+    for block in lattice.half.split(BLOCK_SAMPLES):
         places = dict(zip(AXES, block.place_in(lattice.half), strict=True))
         yield block, [np.asarray(field.isel(places).transpose(*AXES).values) for field in fields]
 

@@ -8,7 +8,7 @@ import xarray as xr
 
 import sobolev_batch as sb
 from sobolev_batch.arrays import Complexes, Reals
-from sobolev_batch.norms import causes, fields
+from sobolev_batch.norms import fields
 from sobolev_batch.transform.lattice import Block
 from sobolev_batch.transform.nufft import evaluate_at
 from sobolev_batch.transform.nufft_costs import NufftSpec
@@ -161,9 +161,7 @@ def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> Non
     a, b = (as_field(values, RANDOM) for values in random_pair(3))
     points = np.random.default_rng(3).uniform(-0.9, 0.9, (50, 3))
     whole, distances = sb.witness(a, b, -2.0, points, eps=1e-13).values, sb.distance(a, b, WITNESS_ORDERS)
-    read = fields.read_blocks
-    for module in (fields, causes):
-        monkeypatch.setattr(module, "read_blocks", lambda lattice, *given: read(lattice, *given, largest=100))
+    monkeypatch.setattr(fields, "BLOCK_SAMPLES", 100)
     assert len(RANDOM.half.split(100)) > 10
     in_blocks = sb.witness(a, b, -2.0, points, eps=1e-13).values
     assert in_blocks == pytest.approx(whole, rel=0, abs=1e-11 * np.abs(whole).max())
