@@ -9,7 +9,6 @@ frequencies across an axis fade slowly: see `_ACROSS`.
 """
 
 from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
 from scipy.special import diric
@@ -35,22 +34,14 @@ class NearAxes:
     """Values of several fields near the three axes of a given lattice, gathered block by block."""
 
     def __init__(self, lattice: Lattice, count: int) -> None:
-        self.lattice = lattice
-        self._values = [np.zeros((count, *block.shape), dtype=np.complex128) for block in self._blocks]
-
-    @cached_property
-    def _blocks(self) -> tuple[Block, Block, Block]:
-        end, wide = self.lattice.M // 2, self._width
+        self.lattice, end = lattice, lattice.M // 2
+        most = int(np.sqrt(_MOST_BYTES / (3 * 16 * 2 * (lattice.M + 1)))) - 1
+        # Samples on each side of an axis.
+        self._width = wide = max(1, min(int(np.ceil(_ACROSS / lattice.spacing)), most, end))
         along, across = (-end, 2 * end + 1), (-wide, 2 * wide + 1)
         sides = (along, across, (0, wide + 1)), (across, along, (0, wide + 1)), (across, across, (0, end + 1))
-        return tuple(Block(*zip(*side, strict=True)) for side in sides)  # type: ignore[return-value]
-
-    @property
-    def _width(self) -> int:
-        """Samples on each side of an axis."""
-        lattice = self.lattice
-        most = int(np.sqrt(_MOST_BYTES / (3 * 16 * 2 * (lattice.M + 1)))) - 1
-        return max(1, min(int(np.ceil(_ACROSS / lattice.spacing)), most, lattice.M // 2))
+        self._blocks = [Block(*zip(*side, strict=True)) for side in sides]
+        self._values = [np.zeros((count, *block.shape), dtype=np.complex128) for block in self._blocks]
 
     def take(self, fields: slice, block: Block, values: Complexes) -> None:
         """Take what is needed of a block of some fields, (fields, *block.shape)."""
@@ -104,7 +95,6 @@ class NearAxes:
             # The other half along the axis is the conjugate at the opposite of frequencies across it.
             mirrored = values[:, ::-1, ::-1, :0:-1].conj()
             values = np.concatenate([mirrored, values], axis=3)[:, :, self._width :]
-            return np.moveaxis(values, 3, 1)
         return np.moveaxis(values, axis + 1, 1)
 
 
