@@ -80,10 +80,6 @@ class Arrangement:
         places = [every.index(s) for s in parts[0]], [every.index(s) for s in parts[1]]
         return cls(order, runs, shells[order], trapezoid, by_order, places, windows)
 
-    def zeros(self, *shape: int) -> Sums:
-        """Return sums of zero for squares or products of fields."""
-        return Sums.zeros(len(self.places[0]), *shape)
-
     def products(self, first: Complexes, second: Complexes) -> Sums:
         """Return the contributions of this block to the inner products Re <a_i, b_j>_s of fields.
 
@@ -92,7 +88,7 @@ class Arrangement:
         """
         m, n = len(first), len(second)
         left, right = first.view(np.float64), second.view(np.float64)
-        sums = self.zeros(m, n)
+        sums = Sums.zeros(len(self.places[0]), m, n)
         # Allocated once: large temporaries cost as much as the arithmetic on them.
         buffer = np.empty((len(self.by_order) + 1) * n * 2 * _COLUMNS)
         for run, columns, weights in self._column_batches():
@@ -105,7 +101,7 @@ class Arrangement:
     def squares(self, fields: Complexes) -> Sums:
         """Return the products of fields (m, block.size) with themselves, in arrays that end in (m,)."""
         values = fields.view(np.float64)
-        sums = self.zeros(len(fields))
+        sums = Sums.zeros(len(self.places[0]), len(fields))
         buffer = np.empty(len(fields) * 2 * _COLUMNS)
         for run, columns, weights in self._column_batches():
             squared = buffer[: len(fields) * weights.shape[1]].reshape(len(fields), -1)

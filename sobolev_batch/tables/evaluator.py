@@ -357,7 +357,7 @@ class Evaluator:
 
         held = read(rows, np.empty((len(rows), block.size), dtype=np.complex128))
         left = arrangement.squares(held)
-        products, right = arrangement.zeros(len(rows), len(others)), arrangement.zeros(len(others))
+        products, right = (Sums.zeros(len(self.orders), *shape, len(others)) for shape in ((len(rows),), ()))
 
         def multiply(group: slice, fields: Complexes, above: int) -> None:
             for array, found in zip(products.arrays, arrangement.products(held[:above], fields).arrays, strict=True):
