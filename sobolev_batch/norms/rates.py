@@ -110,11 +110,9 @@ def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals
     usable = np.flatnonzero(np.isfinite(sizes) & (sizes > 0) & (distances > 0) & (errors < distances))
     by_size = usable[np.argsort(-sizes[usable], kind="stable")]
     coarser_counts = np.searchsorted(-sizes[by_size], -_LEAST_RATIO * sizes[by_size], side="right")
-    for fine, count in zip(by_size, coarser_counts, strict=True):
-        if count:
-            coarse = by_size[count - 1]
-            span = np.log(sizes[coarse] / sizes[fine])
-            rates[fine] = np.log(distances[coarse] / distances[fine]) / span
-            # The widest that both distances allow.
-            uncertainties[fine] = sum(-np.log1p(-errors[i] / distances[i]) for i in (coarse, fine)) / span
+    fine, coarse = by_size[coarser_counts > 0], by_size[coarser_counts[coarser_counts > 0] - 1]
+    span = np.log(sizes[coarse] / sizes[fine])
+    rates[fine] = np.log(distances[coarse] / distances[fine]) / span
+    # The widest that both distances allow.
+    uncertainties[fine] = sum(-np.log1p(-errors[i] / distances[i]) for i in (coarse, fine)) / span
     return rates, uncertainties
