@@ -184,16 +184,9 @@ def labelled_distances(
     order: Orders, distances: NormEstimate, reference: ReferenceEstimate, attributes: Mapping[str, object]
 ) -> xr.Dataset:
     """Return distances and what they are relative to the reference, in the form of `labelled`."""
-    relative, relative_errors = distances.relative_to(reference.norms)
-    shares, share_errors = reference.area_shares(distances)
-    columns = {
-        "relative": relative,
-        "relative_error": relative_errors,
-        "area_share": shares,
-        "area_share_error": share_errors,
-        "excess": reference.excesses,
-    }
-    return labelled(order, {**distances.named("distance"), **columns}, attributes)
+    relative, shares = distances.relative_to(reference.norms), reference.area_shares(distances)
+    columns = {**distances.named("distance"), **relative, **shares, "excess": reference.excesses}
+    return labelled(order, columns, attributes)
 
 
 def lattice_attributes(lattice: Lattice, *fields: xr.DataArray) -> dict[str, Any]:

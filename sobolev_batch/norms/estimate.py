@@ -54,17 +54,17 @@ class NormEstimate:
     @property
     def stacked(self) -> Reals:
         """Values and the parts of their errors, (5, orders, ...)."""
-        parts = self.values, self.truncation, self.aliasing, self.discretisation, self.statistical
-        return np.stack(np.broadcast_arrays(*parts))
+        return np.stack(np.broadcast_arrays(*vars(self).values()))
 
     @property
     def errors(self) -> Reals:
         """Total error: the true value differs from the reported one by no more, as far as the parts hold."""
         return self.truncation + self.aliasing + self.discretisation + self.statistical
 
-    def relative_to(self, norms: NormEstimate) -> tuple[Reals, Reals]:
-        """Return the values over some norms, and bounds on the errors; see `quotients`."""
-        return quotients((self.values, self.errors), (norms.values, norms.errors))
+    def relative_to(self, norms: NormEstimate) -> dict[str, Reals]:
+        """Return the values over some norms, and bounds on the errors, by name; see `quotients`."""
+        relative, errors = quotients((self.values, self.errors), (norms.values, norms.errors))
+        return {"relative": relative, "relative_error": errors}
 
     def named(self, name: str) -> dict[str, Reals]:
         """Return the values under a name, the error, and as "error_part" its `PARTS` (orders, ..., part)."""
@@ -211,8 +211,8 @@ class ReferenceEstimate:
         # Equal surfaces have no product, however uncertain the norm of each is.
         return cls(norms, values, np.where(distances.values + distances.errors == 0, 0.0, errors))
 
-    def area_shares(self, distances: NormEstimate) -> tuple[Reals, Reals]:
-        """Return which share of the squared distances a change of total area explains, and bounds on their errors.
+    def area_shares(self, distances: NormEstimate) -> dict[str, Reals]:
+        """Return which share of squared distances a change of total area explains, by name, with bounds on the errors.
 
         The best multiple c b of the reference explains <a - b, b>² / ||b||² of ||a - b||².
         """
@@ -222,7 +222,8 @@ class ReferenceEstimate:
             shares = np.minimum((products / (distances.values * norms.values)) ** 2, 1.0)
             fewest = lowest / (distances.values + distances.errors)
             most = highest / np.maximum(distances.values - distances.errors, 0.0)
-        return shares, np.maximum(shares - fewest**2, np.minimum(most**2, 1.0) - shares)
+        errors = np.maximum(shares - fewest**2, np.minimum(most**2, 1.0) - shares)
+        return {"area_share": shares, "area_share_error": errors}
 
     @property
     def _area_bounds(self) -> tuple[Reals, Reals]:

@@ -209,11 +209,9 @@ class Results:
         distances, errors = self.to_reference.values, self.to_reference.errors
         families, ordered_by = (self.meshes[name].values for name in ("family", "ordered_by"))
         rates, rate_errors = rates_in_families(families, ordered_by, distances, errors, sizes)
-        relative, relative_errors = self.to_reference.relative_to(NormEstimate(*self.norms.stacked[..., [reference]]))
         columns = {
             **self.to_reference.named("distance"),
-            "relative": relative,
-            "relative_error": relative_errors,
+            **self.to_reference.relative_to(NormEstimate(*self.norms.stacked[..., [reference]])),
             **dict(zip(AREA_AND_SHAPE, self.parts, strict=True)),
             "beyond": self.beyond[1],
             "rate": rates,

@@ -97,7 +97,7 @@ class StoreAccessor:
         evaluator, rows = stored_evaluator(self._tree, order, *labels, other)
         found = evaluator.norms(rows[:-1])
         columns = {**found.distances.named("distance"), **found.reference.area_and_shape(found.distances)}
-        columns["relative"], columns["relative_error"] = found.distances.relative_to(found.reference.norms)
+        columns |= found.distances.relative_to(found.reference.norms)
         table = table_of(columns, meshes.sel(mesh=labels), evaluator.orders)
         return self._chosen(table, order, mesh if isinstance(mesh, str) else labels)
 
