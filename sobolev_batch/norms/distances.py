@@ -96,8 +96,8 @@ def norm(
     [4.39, 3.258]
     """
     orders = check_orders(order)
-    if (accuracy := accuracy_of(rtol, memory, best_effort, seed, on_progress)) is not None:
-        return to_accuracy("norm", (a,), order, lattice, accuracy, seed, on_progress)[0]
+    if solved := to_accuracy("norm", (a,), order, lattice, rtol, memory, best_effort, seed, on_progress):
+        return solved[0]
     if spheres := _spheres(a, lattice=lattice):
         values = np.sqrt([sphere_inner_product(spheres[0], spheres[0], s) for s in orders])
         return labelled(order, _closed_form(values, values**2).named("norm"), {})
@@ -158,8 +158,8 @@ def distance(
     """
     orders = check_orders(order)
     a, b = each(as_operand, {"a": a, "b": b})
-    if (accuracy := accuracy_of(rtol, memory, best_effort, seed, on_progress)) is not None:
-        return to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)[0]
+    if solved := to_accuracy("distance", (a, b), order, lattice, rtol, memory, best_effort, seed, on_progress):
+        return solved[0]
     if spheres := _spheres(a, b, lattice=lattice):
         return _distance_of_spheres(spheres[0], spheres[1], order)
     has_fields = isinstance(a, xr.DataArray) or isinstance(b, xr.DataArray)
@@ -188,37 +188,32 @@ def distance(
     return labelled_distances(order, distances, reference, lattice_attributes(weights.lattice, first, second))
 
 
-def accuracy_of(
-    rtol: float | None,
-    memory: float | str | None,
-    best_effort: bool,
-    seed: int,
-    on_progress: Callable[[str], object] | None,
-) -> Accuracy | None:
-    """Return the accuracy that parameters of the public functions ask for, of which all are checked; None for none."""
-    check_flags(best_effort=best_effort)
-    check_seed(seed)
-    callback(on_progress)
-    if rtol is not None:
-        accuracy = Accuracy(rtol, best_effort=best_effort)
-        return accuracy if memory is None else replace(accuracy, allowed_bytes=available(memory))
-    if memory is not None:
-        raise InputError("memory limits the computation for an rtol; pass an rtol with it, or leave memory out")
-    if best_effort:
-        raise InputError("a best effort is made for an rtol; pass an rtol with it, or leave best_effort out")
-    return None
-
-
 def to_accuracy(
     name: str,
     operands: Sequence[OperandLike],
     order: Orders,
     lattice: Lattice | None,
-    accuracy: Accuracy,
+    rtol: float | None,
+    memory: float | str | None,
+    best_effort: bool,
     seed: int,
-    on_progress: Callable[[str], object] | None = None,
-) -> tuple[xr.Dataset, Reference | None]:
-    """Compute a norm or distance, and its reference, to an accuracy; attributes hold the settings that were chosen."""
+    on_progress: Callable[[str], object] | None,
+) -> tuple[xr.Dataset, Reference | None] | None:
+    """Compute a norm or distance, and its reference, to an rtol by parameters of public functions; None without one.
+
+    Attributes hold the settings that were chosen.
+    """
+    check_flags(best_effort=best_effort)
+    check_seed(seed)
+    callback(on_progress)
+    if rtol is None:
+        if memory is not None:
+            raise InputError("memory limits the computation for an rtol; pass an rtol with it, or leave memory out")
+        if best_effort:
+            raise InputError("a best effort is made for an rtol; pass an rtol with it, or leave best_effort out")
+        return None
+    accuracy = Accuracy(rtol, best_effort=best_effort)
+    accuracy = accuracy if memory is None else replace(accuracy, allowed_bytes=available(memory))
     orders = check_orders(order)
     surfaces = [as_surface(operand) for operand in operands if not isinstance(operand, xr.DataArray)]
     if lattice is not None or len(surfaces) < len(operands):

@@ -18,7 +18,7 @@ from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.frequencies import Frequencies
 from sobolev_batch.norms.accuracy.problem import support_of
 from sobolev_batch.norms.columns import labelled
-from sobolev_batch.norms.distances import accuracy_of, distance, to_accuracy
+from sobolev_batch.norms.distances import distance, to_accuracy
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.transform.fourier import ErrorTarget, Execution
 from sobolev_batch.transform.lattice import Lattice, Orders, check_orders
@@ -77,11 +77,9 @@ def yardsticks(
     True
     """
     a, b = each(as_mesh, {"a": a, "b": b})
-    orders, solved = check_orders(order), None
-    if (accuracy := accuracy_of(rtol, memory, best_effort, seed, on_progress)) is None:
-        found = distance(a, b, order, lattice=lattice)
-    else:
-        found, solved = to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)
+    orders = check_orders(order)
+    known = to_accuracy("distance", (a, b), order, lattice, rtol, memory, best_effort, seed, on_progress)
+    found, solved = known or (distance(a, b, order, lattice=lattice), None)
     distances, errors, relative = (np.atleast_1d(found[name].values) for name in ("distance", "error", "relative"))
     estimate = NormEstimate(distances, *np.reshape(found["error_part"].values, (len(orders), -1)).T)
     columns = {name: np.full(len(orders), np.nan) for name in ("moved", "moved_error")}
