@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 import xarray as xr
@@ -18,7 +17,7 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.formats.conversion import as_surface, each
-from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Surface
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent
 from sobolev_batch.machine import available, available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.frequencies import Reference
@@ -170,11 +169,8 @@ def distance(
     weights = SobolevWeights(Lattice.from_field(first), orders)
     (squares, products, own), near_axes = shells_against(first, second, weights.lattice)
     images, images_of_second = images_at(near_axes.images(), orders).T
-    beyond: Reals | float = np.nan
-    if not has_fields and (
-        found := remainder_of_flat((cast(Surface, a), cast(Surface, b)), weights.lattice.xi_max, orders)
-    ):
-        beyond = found.bounds(orders)
+    found = None if has_fields else remainder_of_flat((a, b), weights.lattice.xi_max, orders)
+    beyond = np.nan if found is None else found.bounds(orders)
     distances = _estimate(weights, squares, [first, second], images, beyond)
     of_second = _estimate(weights, own, [second], images_of_second)
     known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]

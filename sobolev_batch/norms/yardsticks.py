@@ -10,13 +10,11 @@ import numpy as np
 import xarray as xr
 from scipy.optimize import brentq
 
-from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
-from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.frequencies import Frequencies
-from sobolev_batch.norms.accuracy.problem import support_of
+from sobolev_batch.norms.accuracy.problem import ROUNDING, support_of
 from sobolev_batch.norms.columns import labelled
 from sobolev_batch.norms.distances import distance, to_accuracy
 from sobolev_batch.norms.estimate import NormEstimate
@@ -25,8 +23,6 @@ from sobolev_batch.transform.lattice import Lattice, Orders, check_orders
 
 # Error of the values of the mesh, as a fraction of the distance.
 _VALUES_ACCURACY = 1e-2
-# No values are exact to less than this fraction of the area.
-_ROUNDING = 1e-13
 # A search ends where the move is known to this logarithm. It begins between moves that differ by this factor.
 _CLOSENESS, _STEP = 1e-3, 2.0
 # Factor by which the error of a move grows until it is confirmed, and how often.
@@ -85,11 +81,11 @@ def yardsticks(
     columns = {name: np.full(len(orders), np.nan) for name in ("moved", "moved_error")}
     if (resolved := np.flatnonzero(distances > errors)).size:
         if solved is not None:
-            b, frequencies, values = cast(Mesh, solved.surface), solved.frequencies, solved.values
+            b, frequencies, values = solved.surface, solved.frequencies, solved.values
         else:
             # Without an accuracy there is a lattice.
             frequencies = Frequencies(cast(Lattice, lattice), (), orders, support_of([a, b]).widths)
-            values_errors = np.maximum(_VALUES_ACCURACY * np.maximum(distances, errors), _ROUNDING * b.area)
+            values_errors = np.maximum(_VALUES_ACCURACY * np.maximum(distances, errors), ROUNDING * b.area)
             target = ErrorTarget(orders, tuple(values_errors.tolist()))
             values = frequencies.values(b, target, Execution(threads=available_cores()))
         (_, radius), moved = b.bounding_sphere, frequencies.moved(values, b)
@@ -122,7 +118,10 @@ def _as_far(
     while gap(low) > 0 and low > math.log(_LEAST):
         low -= math.log(_STEP)
     moved = math.exp(brentq(gap, low, high, xtol=_CLOSENESS) if low < high else low)
-    error = _error_of_both(wanted, distances(moved))[order]
+    # At the same frequencies truncation may only add to both: the larger one bounds what it changes between them.
+    both = wanted, distances(moved)
+    others = sum(one.errors - one.truncation for one in both)
+    error = (np.maximum(*(one.truncation for one in both)) + others)[order]
     uncertain = moved * (error / value + _CLOSENESS)
     for _ in range(_MOST_STEPS):
         if moved + uncertain > _MOST:
@@ -133,12 +132,3 @@ def _as_far(
             return moved, uncertain
         uncertain *= _WIDER
     return math.nan, math.nan
-
-
-def _error_of_both(first: NormEstimate, second: NormEstimate) -> Reals:
-    """Return bounds on the error (orders,) of the difference of two distances at the same frequencies.
-
-    Truncation may only add to both: then the larger one bounds what it changes between them.
-    """
-    truncation = np.maximum(first.truncation, second.truncation)
-    return np.asarray(truncation + sum(one.errors - one.truncation for one in (first, second)))

@@ -26,7 +26,7 @@ from sobolev_batch.transform.probe import Sample, draws_for, estimate, needs_pro
 # A distance is first estimated from a few frequencies; it is seldom less than this fraction of the estimate.
 ESTIMATE_CAUTION = 0.7
 # No field is exact to less than this fraction of its area. Near-duplicates, that close, have no relative accuracy.
-_ROUNDING = 1e-13
+ROUNDING = 1e-13
 # What rounding to single precision changes a value by, relative to it, and the fraction of an error that it may take.
 _STORED_ROUNDING, _STORED_FRACTION = 6e-8, 0.1
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
@@ -169,7 +169,7 @@ class Problem:
     @property
     def rounding(self) -> float:
         """Smallest norm that differs from zero by more than rounding."""
-        return _ROUNDING * self.area
+        return ROUNDING * self.area
 
     @cached_property
     def _samples(self) -> dict[Lattice, tuple[Sample, ...]]:
@@ -248,7 +248,7 @@ class Problem:
 
 def error_target(values: Reals, orders: tuple[float, ...], accuracy: Accuracy, area: float) -> ErrorTarget:
     """Return the target of both fields of a pair together at these distances (orders,): never below rounding."""
-    errors = np.maximum(accuracy.discretisation_parts(orders) * values, _ROUNDING * area)
+    errors = np.maximum(accuracy.discretisation_parts(orders) * values, ROUNDING * area)
     return ErrorTarget(orders, tuple(errors.tolist()))
 
 
@@ -272,7 +272,7 @@ def support_of(surfaces: Sequence[Surface]) -> Support:
 
 def are_equal(a: Surface, b: Surface) -> bool:
     """Return whether two meshes are equal as area measures, to rounding."""
-    return abs(a.area - b.area) <= _ROUNDING * (a.area + b.area) and not overlap.without_common_parts((a, b))
+    return abs(a.area - b.area) <= ROUNDING * (a.area + b.area) and not overlap.without_common_parts((a, b))
 
 
 def _rounding(surfaces: Sequence[Surface]) -> float:
