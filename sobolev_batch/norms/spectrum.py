@@ -87,8 +87,8 @@ class ComparedSpectra:
 
     def product(self, reference: Spectra) -> Spectra:
         """Return the spectra of the products, whose moments and peaks are bounded by Schwarz's inequality."""
-        moments = _geometric_means(self.distance.moments, reference.moments)
-        peaks = _geometric_means(self.distance.peaks, reference.peaks)
+        bounds = ([np.maximum(one.moments, 0.0), np.maximum(one.peaks, 0.0)] for one in (self.distance, reference))
+        moments, peaks = (np.sqrt(own * other) for own, other in zip(*bounds, strict=True))
         return replace(self._spectra("product"), moments=moments, peaks=peaks)
 
     def _spectra(self, name: str) -> Spectra:
@@ -174,10 +174,6 @@ class _Segment:
             return Scatter(False, len(groups) * groups.var(axis=0, ddof=1), largest, len(groups) - 1)
         spread = np.maximum((weights**2 @ moments.T) - groups[0] ** 2 / count, 0.0)
         return Scatter(True, spread * count / max(count - 1, 1), largest, count - 1)
-
-
-def _geometric_means(first: Reals, second: Reals) -> Reals:
-    return np.asarray(np.sqrt(np.maximum(first, 0.0) * np.maximum(second, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
