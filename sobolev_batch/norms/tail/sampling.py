@@ -100,19 +100,10 @@ class OctaveSampling:
     normals: FaceNormals
     uniform_fraction: float = 1.0
 
-    @classmethod
-    def random(
-        cls,
-        octave: Octave,
-        sizes: Sequence[int],
-        draws: int,
-        normals: FaceNormals,
-        uniform_fraction: float,
-        rng: np.random.Generator,
-    ) -> Self:
-        """Draw lattices with some numbers M of samples along an axis, and a seed."""
+    def redrawn(self, octave: Octave, sizes: Sequence[int], draws: int, rng: np.random.Generator) -> Self:
+        """Draw lattices with some numbers M of samples along an axis, and a seed, for an octave; directions stay."""
         lattices = tuple(OctaveLattice.random(octave.lowest, octave.highest, M, rng) for M in sizes)
-        return cls(octave, lattices, draws, int(rng.integers(2**53)), normals, uniform_fraction)
+        return replace(self, octave=octave, lattices=lattices, draws=draws, seed=int(rng.integers(2**53)))
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -209,9 +200,9 @@ class TailSampling:
     def usual(cls, cutoff: float, count: int, surfaces: Sequence[Surface], seed: int = 0) -> Self:
         """Return a sampling of some octaves by one lattice each, and by draws where surfaces have flat faces."""
         rng, normals = np.random.default_rng(seed), FaceNormals.from_surfaces(surfaces)
-        octaves = (Octave(cutoff, index) for index in range(1, count + 1))
-        usual = [USUAL_M], _USUAL_DRAWS if normals else 0, normals, _USUAL_UNIFORM, rng
-        return cls(cutoff, tuple(OctaveSampling.random(one, *usual) for one in octaves))
+        octaves, draws = (Octave(cutoff, index) for index in range(1, count + 1)), _USUAL_DRAWS if normals else 0
+        usual = OctaveSampling(Octave(cutoff, 1), (), draws, seed, normals, _USUAL_UNIFORM)
+        return cls(cutoff, tuple(usual.redrawn(one, [USUAL_M], draws, rng) for one in octaves))
 
     @classmethod
     def joined(cls, cutoff: float, several: Sequence[Sequence[OctaveSampling]], normals: FaceNormals) -> Self:
@@ -229,26 +220,21 @@ class TailSampling:
         rng, samplings = np.random.default_rng(seed), []
         for one in self.octaves:
             sizes = [min(2 * round(it.M * factor ** (1 / 3) / 2), max(largest, it.M)) for it in one.lattices]
-            count = round(factor * one.draws)
-            samplings.append(OctaveSampling.random(one.octave, sizes, count, one.normals, one.uniform_fraction, rng))
-        sizes, normals = [lattice.M for lattice in samplings[-1].lattices], self.octaves[0].normals
-        for index in range(len(samplings) + 1, len(samplings) + 1 + more_octaves):
-            octave, last = Octave(self.cutoff, index), samplings[-1]
-            samplings.append(OctaveSampling.random(octave, sizes, last.draws, normals, last.uniform_fraction, rng))
+            samplings.append(one.redrawn(one.octave, sizes, round(factor * one.draws), rng))
+        last = samplings[-1]
+        for index in range(last.octave.index + 1, last.octave.index + 1 + more_octaves):
+            sizes = [lattice.M for lattice in last.lattices]
+            samplings.append(last.redrawn(Octave(self.cutoff, index), sizes, last.draws, rng))
         return replace(self, octaves=tuple(samplings))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the sampling as a dictionary for JSON, from which `from_dict` makes it again."""
-        normals = self.octaves[0].normals
-
-        def of_lattice(lattice: OctaveLattice) -> dict[str, Any]:
-            return {"M": lattice.M, "quaternion": list(lattice.quaternion), "offset": list(lattice.offset)}
-
-        return {
-            "cutoff": self.cutoff,
-            "normals": {name: getattr(normals, name).tolist() for name in ("directions", "shares", "sizes")},
-            "octaves": [{"lattices": [of_lattice(it) for it in one.lattices], **one.drawn_by} for one in self.octaves],
-        }
+        octaves = []
+        for one in self.octaves:
+            lattices = [{"M": it.M, "quaternion": [*it.quaternion], "offset": [*it.offset]} for it in one.lattices]
+            octaves.append({"lattices": lattices, **one.drawn_by})
+        normals = {name: values.tolist() for name, values in vars(self.octaves[0].normals).items()}
+        return {"cutoff": self.cutoff, "normals": normals, "octaves": octaves}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
@@ -258,10 +244,8 @@ class TailSampling:
         samplings = []
         for index, one in enumerate(values["octaves"], 1):
             octave = Octave(values["cutoff"], index)
-            lattices = tuple(
-                OctaveLattice(octave.lowest, octave.highest, it["M"], tuple(it["quaternion"]), tuple(it["offset"]))
-                for it in one["lattices"]
-            )
+            found = ((it["M"], tuple(it["quaternion"]), tuple(it["offset"])) for it in one["lattices"])
+            lattices = tuple(OctaveLattice(octave.lowest, octave.highest, *it) for it in found)
             samplings.append(OctaveSampling(octave, normals=normals, **{**one, "lattices": lattices}))
         return cls(values["cutoff"], tuple(samplings))
 

@@ -36,7 +36,8 @@ TARGET = ErrorTarget(ORDERS, (1e-4, 1e-4))
 
 def sampling_of(surface: Surface, seed: int, intervals: int = 16, draws: int = 200) -> OctaveSampling:
     sizes, rng = [intervals] if intervals else [], np.random.default_rng(seed)
-    found = OctaveSampling.random(OCTAVE, sizes, draws, FaceNormals.from_surfaces([surface]), 0.3, rng)
+    normals = FaceNormals.from_surfaces([surface])
+    found = OctaveSampling(OCTAVE, (), draws, 0, normals, 0.3).redrawn(OCTAVE, sizes, draws, rng)
     return replace(found, seed=seed)
 
 
