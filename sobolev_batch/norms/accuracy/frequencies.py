@@ -82,11 +82,6 @@ class Frequencies:
         octaves = (octave_values(surface, octave, self.orders, target, execution) for octave in self.octaves)
         return SurfaceValues(field, tuple(octaves))
 
-    def norms(self, values: Sequence[SurfaceValues], surfaces: Sequence[Surface], signs: Sequence[int]) -> NormEstimate:
-        """Return the norms of a signed sum of surfaces."""
-        measure = Measure.from_values(values, signs)
-        return self.norms_of(measure, surfaces, self.errors(values), self.tail(measure, surfaces, signs))
-
     def moved(self, values: SurfaceValues, surface: Surface) -> Callable[[float], NormEstimate]:
         """Return a function of the distance (orders,) of a surface to itself moved by a length: the rms of directions.
 
