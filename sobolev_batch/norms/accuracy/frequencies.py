@@ -141,30 +141,25 @@ class Frequencies:
         return remainder(surfaces, signs, self._cutoff, self.orders, is_scale=len(surfaces) == 1)
 
     def against(
-        self,
-        difference: Sequence[SurfaceValues],
-        reference: SurfaceValues,
-        surfaces: Sequence[Surface],
-        signs: Sequence[int],
-        pair: Sequence[Surface],
-        moved: Reals | float = 0.0,
-        remainders: Sequence[Remainder] = (),
+        self, problem: Problem, solution: Solution, difference: Sequence[SurfaceValues], reference: SurfaceValues
     ) -> ReferenceEstimate:
-        """Return the norm of the reference b of a pair a, b, and the product <a - b, b>.
+        """Return the norm of the reference b of a problem's pair a, b, and the product <a - b, b>.
 
-        The difference a - b is a signed sum of surfaces, whose values are given: what a and b both have may be left
-        out, and it may lack a norm that is moved, see `Problem`. What lies beyond some cutoffs may be known of it.
+        The difference a - b is the signed sum of the problem's surfaces, whose values are given. The solution may know
+        what lies beyond some cutoffs.
         """
+        surfaces, signs, pair = problem.surfaces, problem.signs, problem.pair
         a_minus_b, b = Measure.from_values(difference, signs), Measure.from_values([reference], [1])
         a = Measure.from_values([*difference, reference], [*signs, 1])
-        known = next((one for one in remainders if one.cutoff == self._cutoff and one.is_known), None)
+        known = next((one for one in solution.remainders if one.cutoff == self._cutoff and one.is_known), None)
         beyond = (known or self._beyond(surfaces, signs)) if self.has_tail else None
         of_difference = self.tail(a_minus_b, surfaces, signs, beyond)
-        tails = self.tail(a, pair[:1], [1]), self.tail(b, pair[1:], [1]), of_difference
-        norms = self.norms_of(b, pair[1:], self.errors([reference]), tails[1])
-        distances = self.norms_of(a_minus_b, surfaces, self.errors(difference) + moved, tails[2])
+        of_b = self.tail(b, pair[1:], [1])
+        norms = self.norms_of(b, pair[1:], self.errors([reference]), of_b)
+        distances = self.norms_of(a_minus_b, surfaces, self.errors(difference) + problem.moved, of_difference)
+        tails = self.tail(a, pair[:1], [1]), of_b, of_difference
         products, tail = self.lattice_sums(a_minus_b, b), Tail.of_product(self.octave_integral(a_minus_b, b), *tails)
-        if beyond is not None and tail is not None and surfaces is pair:
+        if beyond is not None and tail is not None and problem.is_whole:
             # Of whole surfaces the points of the distance show the product too.
             values, errors = beyond.products_at(self.orders)
             values = np.where(errors < tail.remainder_error, values, tail.remainder)
@@ -200,11 +195,9 @@ class Reference:
             known = ReferenceEstimate(norms, -(norms.values**2), errors)
             return cls(Frequencies.from_solution(own, of_own), of_own.values[0], own.surfaces[0], known)
         if problem.is_whole:
-            frequencies, pair = Frequencies.from_solution(problem, solution), problem.pair
-            found = frequencies.against(
-                solution.values, solution.values[1], pair, problem.signs, pair, remainders=solution.remainders
-            )
-            return cls(frequencies, solution.values[1], pair[1], found)
+            frequencies, of_b = Frequencies.from_solution(problem, solution), solution.values[1]
+            known = frequencies.against(problem, solution, solution.values, of_b)
+            return cls(frequencies, of_b, problem.pair[1], known)
         move = centering(problem.pair, OFF_CENTER)
         pair = [move.apply(surface) for surface in problem.pair]
         support = replace(support_of(pair), areas=np.array(pair[1].area))
@@ -218,9 +211,6 @@ class Reference:
             errors = problem.moved * (norms.values + norms.errors)
             return cls(frequencies, values, pair[1], ReferenceEstimate(norms, 0 * errors, errors))
         target = error_target(solution.estimate.values, problem.orders, problem.accuracy, problem.area)
-        surfaces = [move.apply(surface) for surface in problem.surfaces]
-        difference = [frequencies.values(surface, target, problem.execution) for surface in surfaces]
-        found = frequencies.against(
-            difference, values, surfaces, problem.signs, pair, problem.moved, solution.remainders
-        )
-        return cls(frequencies, values, pair[1], found)
+        placed = replace(problem, surfaces=[move.apply(surface) for surface in problem.surfaces], pair=pair)
+        difference = [frequencies.values(surface, target, problem.execution) for surface in placed.surfaces]
+        return cls(frequencies, values, pair[1], frequencies.against(placed, solution, difference, values))
