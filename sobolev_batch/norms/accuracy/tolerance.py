@@ -106,10 +106,8 @@ class Accuracy:
         """Largest M for which two fields and the transform of one fit into the memory; InputError where none does."""
         candidates = range(2, LARGEST_M + 1, 2)
         if not (fitting := bisect_right(candidates, self.allowed_bytes, key=_projected_bytes)):
-            raise InputError(
-                f"{self.allowed_bytes / 1e9:.3g} GB of memory are too little; the smallest lattice takes "
-                f"{_projected_bytes(2) / 1e9:.3g} GB"
-            )
+            found, least = self.allowed_bytes / 1e9, _projected_bytes(2) / 1e9
+            raise InputError(f"{found:.3g} GB of memory are too little; the smallest lattice takes {least:.3g} GB")
         return candidates[fitting - 1]
 
 
@@ -211,13 +209,10 @@ def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Acc
 
 def good_intervals(least: float) -> int:
     """Return an even M of at least ``least`` for which the FFT of the fine grid is fast and hardly padded."""
-
-    def fine_grid(modes: int) -> int:
-        return 2 * int(next_fast_len(modes, real=True))
-
     smallest = 2 * math.ceil(least / 2)
     choices = range(smallest, smallest + max(8, smallest // 8), 2)
-    return min(choices, key=lambda M: (fine_grid(M + 1) ** 2 * fine_grid(M // 2 + 1), -M))
+    # The fine grid has twice as many points along each axis.
+    return min(choices, key=lambda M: (next_fast_len(M + 1, real=True) ** 2 * next_fast_len(M // 2 + 1, real=True), -M))
 
 
 def _refined_period(sums: Sums, weights: SobolevWeights, widths: Reals, accuracy: Accuracy) -> float:
