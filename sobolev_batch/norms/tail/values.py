@@ -80,14 +80,10 @@ def octave_values(
     values: list[Complexes] = []
     finished = 0 if known is None else len(known.sampling.lattices)
     for number, sample_set in enumerate(sampling.sample_sets):
-        if known is not None and number < finished:
-            values.append(known.values[known.sampling.sample_sets[number].samples])
-            continue
-        if known is not None and sample_set.is_drawn and sampling.drawn_by == known.sampling.drawn_by:
-            values.append(known.values[known.sampling.sample_sets[-1].samples])
-            continue
         lattice = None if sample_set.is_drawn else sampling.lattices[number]
-        if lattice is None or SurfaceSize.from_surface(surface).prefers_exact(lattice):
+        if known and (number < finished if lattice else sampling.drawn_by == known.sampling.drawn_by):
+            values.append(known.values[known.sampling.sample_sets[number if lattice else -1].samples])
+        elif lattice is None or SurfaceSize.from_surface(surface).prefers_exact(lattice):
             frequencies = sampling.frequencies[sample_set.samples]
             values.append(kind_of(surface).exact_values(frequencies, execution.threads, execution.backend))
         else:
