@@ -58,6 +58,9 @@ _OFTEN_CLOSE, _SAMPLE, _PAIRS_AT_ONCE = 0.05, 256, 1 << 22
 _FEWEST_FOR_GPU, _PAIRS_ON_DEVICE, _BATCH_ON_DEVICE = 1 << 15, 1 << 23, 1 << 19
 _NODES_AT_ONCE, _NEAR_AT_ONCE = 1 << 20, 1 << 16
 
+# Rows and columns: numbers of a point and a triangle for each pair.
+Pairs = tuple[Indices, Indices]
+
 
 def tail_nodes(cutoff: float, order: float) -> Iterator[tuple[float, Reals, Reals]]:
     """Yield, octave by octave from the step on, where it begins, radii r (k,) and weights of (1 - step(r)) (1+r²)^s."""
@@ -279,10 +282,9 @@ def _on_device(points: Reals, triangles: SignedTriangles, kernels: Kernels, back
     given = points, triangles.corners, triangles.signs, centers, kernels.reach + radii
     points, corners, signs, centers, farthest = map(backend.upload, given)
     tables = {name: backend.upload(getattr(kernels, name)) for name in ("totals", "drops", "values")}
-    kernels = replace(kernels, **tables)
-    step, count = max(1, _PAIRS_ON_DEVICE // len(centers)), 0
+    kernels, count = replace(kernels, **tables), 0
     totals = np.zeros((len(kernels.orders), len(points)), like=points)
-    for some in slices(len(points), step):
+    for some in slices(len(points), max(1, _PAIRS_ON_DEVICE // len(centers))):
         here = points[some]
         rows, columns = np.nonzero(_are_close(here, centers, farthest))
         count += len(rows)
@@ -295,12 +297,7 @@ def _on_device(points: Reals, triangles: SignedTriangles, kernels: Kernels, back
 
 
 def add_compiled(
-    potentials: Reals,
-    points: Reals,
-    triangles: SignedTriangles,
-    pairs: tuple[Indices, Indices],
-    kernels: Kernels,
-    threads: int,
+    potentials: Reals, points: Reals, triangles: SignedTriangles, pairs: Pairs, kernels: Kernels, threads: int
 ) -> None:
     """Do the same for pairs of rows and columns, by the compiled loop."""
     from sobolev_batch.compiled.edges import add_potentials
@@ -309,14 +306,10 @@ def add_compiled(
     limits = np.array([[farthest, largest] for _, farthest, largest in _RULES]) / kernels.fineness
     nodes = np.concatenate([np.column_stack([rule.barycentric, rule.weights]) for rule in rules])
     ends = np.cumsum([0, *(len(rule.weights) for rule in rules)])
-    tables = (
-        *(kernels.cutoff, kernels.reach, kernels.start, kernels.step),
-        *(kernels.totals, kernels.drops, kernels.values, kernels.least, _LINEAR_FROM),
-    )
+    grid = kernels.cutoff, kernels.reach, kernels.start, kernels.step
+    tables = *grid, kernels.totals, kernels.drops, kernels.values, kernels.least, _LINEAR_FROM
     longest = _PANEL / kernels.fineness, _PANEL_WAVES / kernels.fineness / kernels.cutoff
-    panels = *longest, _LAST, np.stack(_PANEL_NODES)
-
-    faces = triangles.corners, triangles.signs
+    panels, faces = (*longest, _LAST, np.stack(_PANEL_NODES)), (triangles.corners, triangles.signs)
 
     def sums_of(rows: Indices, columns: Indices) -> Reals:
         sums = np.zeros_like(potentials)
@@ -441,15 +434,12 @@ def _are_close(points: Array, centers: Array, farthest: Array) -> Array:
     return squares < farthest * farthest
 
 
-def _close_pairs(
-    points: Reals, centers: Reals, radii: Reals, reach: float, share: float
-) -> Iterator[tuple[Indices, Indices]]:
+def _close_pairs(points: Reals, centers: Reals, radii: Reals, reach: float, share: float) -> Iterator[Pairs]:
     """Yield rows and columns of pairs of a point and a triangle that may be closer than a reach."""
     from scipy.spatial import KDTree
 
     if share > _OFTEN_CLOSE:
-        step = max(1, _PAIRS_AT_ONCE // len(centers))
-        for some in slices(len(points), step):
+        for some in slices(len(points), max(1, _PAIRS_AT_ONCE // len(centers))):
             rows, columns = np.nonzero(_are_close(points[some], centers, reach + radii))
             yield rows + some.start, columns
         return
