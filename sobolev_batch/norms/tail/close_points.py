@@ -87,17 +87,11 @@ class Sheets:
     @classmethod
     def from_surfaces(cls, surfaces: Sequence[Surface], signs: Sequence[int], cutoff: float) -> Self:
         """Return the sheets of surfaces; smooth ones become meshes that are fine beside the wavelength at a cutoff."""
-        meshes: list[tuple[Mesh, int]] = []
-        spheres: list[tuple[Sphere, int]] = []
-        lacking = 0.0
-        for surface, sign in zip(surfaces, signs, strict=True):
-            if isinstance(surface, Sphere):
-                spheres.append((surface, sign))
-            elif isinstance(surface, Smooth):
-                meshes.append((_triangulated(surface, cutoff), sign))
-                lacking += surface.area - meshes[-1][0].area
-            elif isinstance(surface, Mesh):
-                meshes.append((surface, sign))
+        replaced = [_triangulated(one, cutoff) if isinstance(one, Smooth) else one for one in surfaces]
+        signed = list(zip(replaced, signs, strict=True))
+        meshes = [(one, sign) for one, sign in signed if isinstance(one, Mesh)]
+        spheres = [(one, sign) for one, sign in signed if isinstance(one, Sphere)]
+        lacking = sum(surface.area - one.area for surface, one in zip(surfaces, replaced, strict=True))
         return cls(meshes, spheres, lacking=lacking)
 
     @property
