@@ -391,10 +391,8 @@ def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
     seed = int(rng.integers(2**53))
     if state.can_draw and alone * state.draw_seconds < seconds:
         return OctaveSampling(octave, (), alone, seed, normals, _UNIFORM_ALONE)
-    beside = 0
-    if normals and state.can_draw:
-        affordable = _DRAWS_FRACTION * seconds / state.draw_seconds
-        beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
+    affordable = min(count, _DRAWS_FRACTION * seconds / state.draw_seconds)
+    beside = int(np.clip(affordable, _FEWEST_DRAWS, _MOST_DRAWS)) if normals and state.can_draw else 0
     return OctaveSampling(octave, (lattice,), beside, seed, normals, _UNIFORM_BESIDE_LATTICE)
 
 
@@ -426,17 +424,15 @@ def _finer_samplings(state: State) -> dict[int, OctaveSampling]:
     ascending = np.argsort(variances)
     decisive = ascending[np.cumsum(variances[ascending]) > _LEFT_FRACTION * permitted[order]]
     of_each = permitted[order] / len(state.octaves)
-    finer = {n: _finer_sampling(state, state.octaves[n], order, of_each) for n in decisive.tolist()}
-    return {number: sampling for number, sampling in finer.items() if sampling is not None}
+    too_large = decisive[variances[decisive] > of_each]
+    return {n: _finer_sampling(state, state.octaves[n], order, of_each) for n in too_large.tolist()}
 
 
-def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling | None:
-    """Return a sampling of an octave with a smaller variance, or None if it is small enough."""
+def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling:
+    """Return a sampling of an octave with a smaller variance."""
     sampling, sums = octave.sampling, octave.sums
     rng = np.random.default_rng([state.seed, state.steps, sampling.octave.index])
     excess = float(sums.variances[order]) / permitted
-    if excess <= 1:
-        return None
     count = int(min(sampling.draws * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
     first = _lattice(state, sampling.octave, _FIRST_M, rng)
     seconds = sum(size.lattice_seconds(first) for size in state.sizes)
