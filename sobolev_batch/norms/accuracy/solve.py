@@ -189,12 +189,10 @@ def _differ_beyond(problem: Problem, lattice: Lattice) -> bool:
 
 def _solve_on_lattices(problem: Problem, lattice: Lattice, is_pilot: bool, *, before_octaves: bool = False) -> Solution:
     """Return the first solution that meets the accuracy, else the last one of a few rounds, or an AccuracyError."""
-    values: Reals | None = None
+    values = ESTIMATE_CAUTION * estimate(problem.samples(lattice), problem.orders)
     # Their fields may differ by a little more.
     equal = _near_duplicates(problem, lattice)
     for rounds_left in reversed(range(_ROUNDS)):
-        if values is None:
-            values = ESTIMATE_CAUTION * estimate(problem.samples(lattice), problem.orders)
         problem.require_above_rounding(values)
         accuracy = _of_pilot(problem.accuracy) if is_pilot else problem.accuracy
         target = error_target(values, problem.orders, accuracy, problem.area).tightened(problem.inexact_count)
@@ -316,16 +314,14 @@ def _beyond_lattice(problem: Problem, solution: Solution) -> tuple[Reals, Reals]
 
 def run_pilot(problem: Problem) -> tuple[Reals, Lattice, ComplexDtype]:
     """Return rough distances (orders,) of a pair, and lattice and dtype that its accuracy needs, or AccuracyError."""
-    lattice, is_pilot = first_lattice(problem.support, problem.orders, problem.accuracy)
-    while True:
+    lattice, is_pilot = first_lattice(problem.support, problem.orders, problem.accuracy)[0], True
+    while is_pilot:
         values = estimate(problem.samples(lattice), problem.orders)
         target = error_target(values, problem.orders, _of_pilot(problem.accuracy), problem.area).tightened(_PAIR)
         solution, sums = _compute(problem, lattice, target, "complex128")
         values = solution.estimate.values
         problem.require_above_rounding(values)
         lattice, is_pilot = _next_lattice(problem, lattice, sums)
-        if not is_pilot:
-            break
     target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(_PAIR)
     for rounds_left in reversed(range(_ROUNDS)):
         dtype = problem.dtype(lattice, target)
