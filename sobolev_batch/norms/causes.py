@@ -13,16 +13,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import checked_points
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
-from sobolev_batch.norms.columns import (
-    AREA,
-    FREQUENCY,
-    KERNEL,
-    LENGTH,
-    NUMBER,
-    described,
-    lattice_attributes,
-    order_axis,
-)
+from sobolev_batch.norms.columns import AREA, FREQUENCY, LENGTH, NUMBER, described, lattice_attributes, order_axis
 from sobolev_batch.norms.fields import OperandLike, field_of, pair_of, read_blocks, shells_of
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.transform.fourier import TransformSettings, require_points_inside, thread_count
@@ -110,7 +101,7 @@ def spectrum(
             "energy": ("band", mean * surfaces, described("energy on a sphere of frequencies", AREA)),
         },
         coords={"order": axis, **band_coordinates(lower, upper, similarity)},
-        attrs={"kernel": KERNEL, **lattice_attributes(lattice, *fields)},
+        attrs=lattice_attributes(lattice, *fields),
     )
 
 
@@ -237,7 +228,6 @@ def witness(
         attrs={
             **described("witness function", "1 / unit length"),
             "description": "positive where the first surface has area that the second lacks",
-            "kernel": KERNEL,
             **lattice_attributes(lattice, first, second),
             "shortest_wavelength": 1 / lattice.xi_max,
         },

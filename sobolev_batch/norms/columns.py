@@ -175,8 +175,7 @@ def order_axis(order: Orders) -> tuple[tuple[str, ...], Reals, dict[str, str]]:
 def labelled(order: Orders, values: Mapping[str, Reals], attributes: Mapping[str, Any]) -> xr.Dataset:
     """Return values (orders,) by name over the dimension `order`, or without dimensions for a single order."""
     axis = order_axis(order)
-    further = {"error_part": [len(PARTS)]}
-    columns = {name: np.reshape(value, (*axis[1].shape, *further.get(name, ()))) for name, value in values.items()}
+    columns = {name: np.reshape(value, (*axis[1].shape, *np.shape(value)[1:])) for name, value in values.items()}
     return dataset_of(columns, axis[0], {"order": axis}).assign_attrs({"kernel": KERNEL, **attributes})
 
 
@@ -192,4 +191,4 @@ def labelled_distances(
 def lattice_attributes(lattice: Lattice, *fields: xr.DataArray) -> dict[str, Any]:
     """Return the attributes of a dataset that was computed from fields on a lattice."""
     dtypes = dict.fromkeys(str(field.dtype) for field in fields)
-    return {"xi_max": lattice.xi_max, "M": lattice.M, "dtype": ", ".join(dtypes)}
+    return {"kernel": KERNEL, "xi_max": lattice.xi_max, "M": lattice.M, "dtype": ", ".join(dtypes)}
