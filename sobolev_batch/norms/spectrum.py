@@ -112,17 +112,12 @@ class _Segment:
     first: int
 
     @property
-    def starts(self) -> list[int]:
-        """First sample of each group, counted from the set's first."""
-        return [0] if self.sample_set.starts is None else [int(start) for start in self.sample_set.starts]
-
-    @property
     def count(self) -> int:
         return int(self.samples.stop - self.samples.start)
 
     @property
     def place(self) -> slice:
-        return slice(self.first, self.first + len(self.starts) * _NODES)
+        return slice(self.first, self.first + len(self.sample_set.starts) * _NODES)
 
     @cached_property
     def node_lengths(self) -> Reals:
@@ -137,7 +132,7 @@ class _Segment:
 
     def moved(self, terms: Reals) -> Reals:
         """Move terms (fields, n) to the radii of each group, (fields, groups · _NODES)."""
-        groups = (slice(*ends) for ends in pairwise([*self.starts, self.count]))
+        groups = (slice(*ends) for ends in pairwise([*self.sample_set.starts, self.count]))
         return np.concatenate([terms[:, group] @ self._interpolation(group) for group in groups], axis=1)
 
     def _interpolation(self, samples: slice) -> Reals:
@@ -225,9 +220,8 @@ class RadialAxis:
     def radii(self) -> Reals:
         """|ξ| of each entry, in cycles per unit length (radii,)."""
         shells = self.lattice.spacing * np.sqrt(np.arange(self.lattice.shell_count))
-        return np.concatenate(
-            [shells, *(np.tile(np.sqrt(segment.node_lengths - 1), len(segment.starts)) for segment in self.segments)]
-        )
+        groups = (np.tile(np.sqrt(one.node_lengths - 1), len(one.sample_set.starts)) for one in self.segments)
+        return np.concatenate([shells, *groups])
 
     @cached_property
     def weights(self) -> Reals:

@@ -64,7 +64,7 @@ class OctaveWeights:
                 continue
             groups = terms = self.by_order[:, sample_set.samples] * squares[sample_set.samples]
             unseen = np.abs(terms).max(axis=1)
-            if sample_set.starts is not None:
+            if not sample_set.is_drawn:
                 groups = np.add.reduceat(terms, sample_set.starts, axis=1)
                 images = deviations_by_images(self.sampling, number, terms[-1:], (*self.orders, 0.0))
                 unseen = np.hypot(unseen, images[:, 0])

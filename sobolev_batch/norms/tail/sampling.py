@@ -24,7 +24,7 @@ from sobolev_batch.transform.lattice import STEP_START, OctaveLattice, smooth_st
 # Samples along an axis of the lattice of each octave, and draws beside it where surfaces have flat faces.
 USUAL_M, _USUAL_DRAWS, _USUAL_UNIFORM = 64, 20_000, 0.1
 _SUBLATTICES = 8
-_NOWHERE: Indices = np.zeros(0, dtype=np.int64)
+_ONE_GROUP: Indices = np.zeros(1, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -66,18 +66,14 @@ class SampleSet:
     Attributes:
         samples: Place of the samples in the octave.
         starts: First sample of each of the eight sublattices, counted from the set's first, int64 (8,). Sums over
-            sublattices are nearly independent. None for drawn samples, which are all independent.
+            sublattices are nearly independent. Drawn samples, which are all independent, are one group.
         places: Indices of the samples in the lattice's block, flattened, int64 (n,); empty for drawn ones.
     """
 
     samples: slice
-    starts: Indices | None
+    starts: Indices
     places: Indices
-
-    @property
-    def is_drawn(self) -> bool:
-        """True for drawn samples."""
-        return self.starts is None
+    is_drawn: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +115,7 @@ class OctaveSampling:
         for places, starts in map(_places_and_starts, self.lattices):
             sets.append(SampleSet(slice(first, first + len(places)), starts, places))
             first += len(places)
-        return (*sets, SampleSet(slice(first, first + self.draws), None, _NOWHERE))
+        return (*sets, SampleSet(slice(first, first + self.draws), _ONE_GROUP, _ONE_GROUP[:0], is_drawn=True))
 
     @cached_property
     def frequencies(self) -> Reals:
@@ -286,7 +282,7 @@ class TailSampling:
                 count = sample_set.samples.stop - sample_set.samples.start
                 labels = np.full((3, count), -1, dtype=np.int64)
                 labels[0] = octave.octave.index
-                if sample_set.starts is not None:
+                if not sample_set.is_drawn:
                     labels[1] = number
                     labels[2] = np.repeat(np.arange(_SUBLATTICES), np.diff([*sample_set.starts, count]))
                 columns.append(labels)
