@@ -78,7 +78,7 @@ def yardsticks(
     found, solved = known or (distance(a, b, order, lattice=lattice), None)
     distances, errors, relative = (np.atleast_1d(found[name].values) for name in ("distance", "error", "relative"))
     estimate = NormEstimate(distances, *np.reshape(found["error_part"].values, (len(orders), -1)).T)
-    columns = {name: np.full(len(orders), np.nan) for name in ("moved", "moved_error")}
+    moves = np.full((2, len(orders)), np.nan)
     if (resolved := np.flatnonzero(distances > errors)).size:
         if solved is not None:
             b, frequencies, values = solved.surface, solved.frequencies, solved.values
@@ -90,10 +90,8 @@ def yardsticks(
             values = frequencies.values(b, target, Execution(threads=available_cores()))
         (_, radius), moved = b.bounding_sphere, frequencies.moved(values, b)
         for i in resolved.tolist():
-            columns["moved"][i], columns["moved_error"][i] = _as_far(
-                lambda amount: moved(amount * radius), i, estimate, float(relative[i])
-            )
-    return found.assign(labelled(order, columns, {}).data_vars)
+            moves[:, i] = _as_far(lambda amount: moved(amount * radius), i, estimate, float(relative[i]))
+    return found.assign(labelled(order, {"moved": moves[0], "moved_error": moves[1]}, {}).data_vars)
 
 
 def _as_far(
