@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.errors import InputError
@@ -78,17 +78,13 @@ def spectrum(
     fields = [field_of(a, lattice, orders)] if b is None else [*pair_of(a, b, lattice, orders)]
     lattice = Lattice.from_field(fields[0])
     edges = _edges(bands, lattice)
-    members = _bands_of_shells(edges, lattice)
-
-    def of_bands(values: Reals) -> Reals:
-        return np.asarray(np.bincount(members, values, len(edges) + 1)[1:-1])
-
     sums = shells_of(fields, lattice)
     weighted = SobolevWeights(lattice, orders).per_shell * sums
-    squared, total = np.stack([of_bands(row) for row in weighted]), weighted.sum(axis=1)
+    *squares, plain, volumes = _sums_of_bands([*weighted, sums, shell_volumes(lattice)], edges, lattice)
+    squared, total = np.stack(squares), weighted.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = squared / total[:, None]
-        mean = of_bands(sums) / of_bands(shell_volumes(lattice))
+        mean = plain / volumes
     lower, upper = edges[:-1], edges[1:]
     surfaces = 4 * np.pi / 3 * (lower**2 + lower * upper + upper**2)
     dims, values, _ = axis = order_axis(order)
@@ -125,12 +121,13 @@ def _edges(bands: int | Sequence[float] | None, lattice: Lattice) -> Reals:
     return edges
 
 
-def _bands_of_shells(edges: Reals, lattice: Lattice) -> NDArray[np.intp]:
-    """Return the band of each shell, counted from 1; 0 for shells below all bands, one more than the last above."""
+def _sums_of_bands(rows: Iterable[Reals], edges: Reals, lattice: Lattice) -> Iterator[Reals]:
+    """Return the sums over each band, (bands,), of rows over the shells of a lattice."""
+    # Bands are counted from 1: 0 is for shells below all bands, one more than the last for those above.
     radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))
     bands = np.searchsorted(edges, radii * (1 + _ON_EDGE), side="right")
     bands[np.abs(radii - edges[-1]) <= _ON_EDGE * edges[-1]] = len(edges) - 1
-    return bands
+    return (np.asarray(np.bincount(bands, row, len(edges) + 1)[1:-1]) for row in rows)
 
 
 def band_coordinates(
