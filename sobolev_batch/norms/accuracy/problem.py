@@ -1,8 +1,7 @@
 """A norm or a distance to compute, the accuracy that it needs, and its division among fields."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -69,6 +68,7 @@ class Problem:
     is_clipped: bool = True
     moved: Reals | float = 0.0
     notify: Callable[[str], object] = str
+    _samples: dict[Lattice, tuple[Sample, ...]] = field(default_factory=dict, init=False)
 
     @classmethod
     def from_surfaces(
@@ -121,11 +121,9 @@ class Problem:
         return replace(self, surfaces=(), moved=moved) if np.all(moved <= _ROUNDED * norms) else self
 
     @classmethod
-    def _between(
-        cls, different: Mapping[int, Surface], pair: Sequence[Surface], orders: tuple[float, ...], *settings: Any
-    ) -> Self:
+    def _between(cls, different: Mapping[int, Surface], pair: Sequence[Surface], *settings: Any) -> Self:
         """Return the problem for what two surfaces do not have in common, by sign, or for one surface."""
-        accuracy, label, threads = settings
+        orders, accuracy, label, threads = settings
         if not different:
             return cls((), orders, accuracy, Support(np.zeros(()), np.zeros(len(DIRECTIONS))), label, threads)
         is_whole = all(one is other for one, other in zip(different.values(), pair, strict=False))
@@ -171,10 +169,6 @@ class Problem:
         """Smallest norm that differs from zero by more than rounding."""
         return ROUNDING * self.area
 
-    @cached_property
-    def _samples(self) -> dict[Lattice, tuple[Sample, ...]]:
-        return {}
-
     def samples(self, lattice: Lattice) -> tuple[Sample, ...]:
         """Return samples of all surfaces at the same frequencies; those of a lattice are computed once."""
         if lattice not in self._samples:
@@ -209,13 +203,10 @@ class Problem:
             for surface, sample in zip(self.surfaces, samples, strict=True)
         )
 
-    def beyond(
-        self, cutoff: float, seed: int = 0, points: int | None = None, orders: Sequence[float] = ()
-    ) -> Remainder:
-        """Return what lies beyond a cutoff at the orders, or at other ones; see `remainder`."""
+    def beyond(self, cutoff: float, seed: int = 0, points: int | None = None) -> Remainder:
+        """Return what lies beyond a cutoff at the orders; see `remainder`."""
         execution = Execution(threads=self.threads)
-        orders = orders or self.orders
-        return remainder(self.surfaces, self.signs, cutoff, orders, points, seed=seed, execution=execution)
+        return remainder(self.surfaces, self.signs, cutoff, self.orders, points, seed, execution)
 
     def require_above_rounding(self, values: Reals) -> None:
         """Refuse an accuracy of norms (orders,) below the rounding of fields, unless it is a best effort."""

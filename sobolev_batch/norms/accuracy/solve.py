@@ -306,7 +306,7 @@ def _beyond_lattice(problem: Problem, solution: Solution) -> tuple[Reals, Reals]
     # What the lattice shows of the range in which the step falls.
     shown = SobolevWeights(lattice, known).per_shell - SobolevWeights(lattice, known, lattice.xi_max).per_shell
     shells = shell_sums(difference, None, lattice, lattice.half)
-    values, errors = problem.beyond(lattice.xi_max, orders=known).at(known)
+    values, errors = replace(problem, orders=known).beyond(lattice.xi_max).at(known)
     # No frequency beyond the lattice weighs more than this at lower orders.
     factors = (1 + lattice.xi_max**2) ** (np.array(problem.orders) - known)
     return factors * (values - shown @ shells), factors * errors
