@@ -249,7 +249,8 @@ def _weight_columns(plan: Plan) -> dict[str, tuple[str, Reals, dict[str, str]]]:
 def _sample_columns(tail: TailSampling) -> dict[str, tuple[str, NDArray[Any], dict[str, str]]]:
     units = {"units": "cycles per unit length"}
     columns = {name: ("sample", column, units) for name, column in zip(AXES, tail.frequencies.T, strict=True)}
-    columns["weight"] = ("sample", tail.weights, {"long_name": "weight in the integral over all frequencies"})
+    weights = np.concatenate([octave.weights for octave in tail.octaves])
+    columns["weight"] = ("sample", weights, {"long_name": "weight in the integral over all frequencies"})
     meanings = {
         "octave": "number of the octave, from 1",
         "lattice": "number of the random lattice in the octave; -1 for drawn samples",

@@ -265,11 +265,6 @@ class TailSampling:
         """ξ of all samples, float64 (n, 3), in cycles per unit length."""
         return np.concatenate([octave.frequencies for octave in self.octaves])
 
-    @property
-    def weights(self) -> Reals:
-        """Weight of each sample in the integral over all of frequency space (n,)."""
-        return np.concatenate([octave.weights for octave in self.octaves])
-
     def split(self, values: NDArray[Any]) -> Iterator[NDArray[Any]]:
         """Yield the values of each octave, from those at all samples (n,)."""
         yield from np.split(values, np.cumsum([len(octave) for octave in self.octaves])[:-1])
