@@ -17,15 +17,15 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.formats.conversion import as_surface, each
-from sobolev_batch.geometry.surface import DIRECTIONS, Extent
+from sobolev_batch.geometry.surface import DIRECTIONS
 from sobolev_batch.machine import available, available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.frequencies import Reference
-from sobolev_batch.norms.accuracy.problem import Problem, are_equal
+from sobolev_batch.norms.accuracy.problem import Problem, are_equal, support_of
 from sobolev_batch.norms.accuracy.solution import Solution
 from sobolev_batch.norms.accuracy.solve import solve
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
-from sobolev_batch.norms.budget import Support, sums_of_shells
+from sobolev_batch.norms.budget import sums_of_shells
 from sobolev_batch.norms.columns import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, estimate_norms
 from sobolev_batch.norms.fields import (
@@ -173,14 +173,16 @@ def distance(
     beyond = np.nan if found is None else found.bounds(orders)
     distances = _estimate(weights, squares, [first, second], images, beyond)
     of_second = _estimate(weights, own, [second], images_of_second)
-    known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
-    if len(known) == len((first, second)) and squares.any():
+    qualities = [quality for quality in map(quality_of, (first, second)) if quality is not None]
+    if len(qualities) == len((first, second)) and squares.any():
         # A study knows how far its fields are from its reference, which may not be that of both.
-        least = np.hypot(distances.values, np.sqrt(known).sum(axis=0)) - distances.values
+        known = np.sqrt([quality.beyond_at(orders) for quality in qualities])
+        least = np.hypot(distances.values, known.sum(axis=0)) - distances.values
         distances = replace(distances, truncation=np.fmax(distances.truncation, least))
-    reference = ReferenceEstimate.from_products(
-        sums_of_shells(products, weights), weights, _widths([first, second]), distances, of_second
-    )
+    # Errors are unknown where a quality is, whatever the widths.
+    widths = support_of(qualities).widths if qualities else np.zeros(len(DIRECTIONS))
+    sums = sums_of_shells(products, weights)
+    reference = ReferenceEstimate.from_products(sums, weights, widths, distances, of_second)
     return labelled_distances(order, distances, reference, lattice_attributes(weights.lattice, first, second))
 
 
@@ -239,20 +241,12 @@ def _estimate(
     Bounds on what lies beyond the lattice in the squared norm, and on what images add to it, (orders,) may be known.
     """
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
-    areas = np.array(sum(quality.area for quality in qualities))
-    errors = np.hypot.reduce([quality.probe.norms(weights) for quality in qualities])
-    support = Support(areas, _widths(fields))
     found = sums_of_shells(sums, weights)
-    estimate = estimate_norms(found, weights, support, errors, is_given=True, beyond=beyond, images=images)
-    if len(qualities) == len(fields):
-        return estimate
-    return NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 4)
-
-
-def _widths(fields: Sequence[xr.DataArray]) -> Reals:
-    """Return the widths of the surfaces of some fields together, see `Support`; zero where they are unknown."""
-    extents = [quality.extent for quality in map(quality_of, fields) if quality is not None]
-    return Extent.union(extents).widths if len(extents) == len(fields) else np.zeros(len(DIRECTIONS))
+    if len(qualities) < len(fields):
+        return NormEstimate(np.sqrt(np.maximum(found.totals, 0.0)), *[np.full(len(weights.orders), np.nan)] * 4)
+    errors = np.hypot.reduce([quality.probe.norms(weights) for quality in qualities])
+    support = support_of(qualities)
+    return estimate_norms(found, weights, support, errors, is_given=True, beyond=beyond, images=images)
 
 
 def _spheres(*operands: OperandLike, lattice: Lattice | None) -> tuple[Sphere, ...]:

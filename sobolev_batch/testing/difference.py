@@ -13,9 +13,9 @@ from sobolev_batch.geometry.closest import signs
 from sobolev_batch.geometry.formats.ply import write_ply
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import vertex_distances
-from sobolev_batch.geometry.surface import Extent, Similarity, Surface, centering
+from sobolev_batch.geometry.surface import Similarity, Surface, centering
+from sobolev_batch.norms.accuracy.problem import support_of
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice
-from sobolev_batch.norms.budget import Support
 from sobolev_batch.norms.causes import witness
 from sobolev_batch.norms.fields import fourier_transform
 from sobolev_batch.plugins import FEATURES, extra
@@ -172,8 +172,6 @@ def write_difference(
 
 def picture_fields(surfaces: Sequence[Surface], order: float) -> tuple[xr.DataArray, xr.DataArray]:
     """Return the Fourier fields of two surfaces around the origin, on a lattice for pictures."""
-    extent = Extent.union([surface.extent for surface in surfaces])
-    area = np.array(sum(surface.area for surface in surfaces))
-    lattice = core_lattice(Support(area, extent.widths, extent.reach), (order,), Accuracy(_ACCURACY))
+    lattice = core_lattice(support_of(surfaces), (order,), Accuracy(_ACCURACY))
     a, b = (fourier_transform(surface, lattice, _EPS, dtype="complex64", order=order) for surface in surfaces)
     return a, b

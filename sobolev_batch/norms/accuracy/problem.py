@@ -16,7 +16,7 @@ from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unre
 from sobolev_batch.norms.bounds import APART_FRACTION, norm_of_moves, norm_of_rounding, product_apart
 from sobolev_batch.norms.budget import Sums, Support, sums_of_shells
 from sobolev_batch.norms.estimate import NormEstimate
-from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
+from sobolev_batch.norms.fields import USUAL_DEGREE, Field, Quality, field_for
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, cheapest_dtype
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
@@ -255,8 +255,8 @@ def sums_on(problem: Problem, fields: Sequence[Field], weights: SobolevWeights) 
     return sums, np.hypot.reduce([field.quality.probe.norms(weights) for field in fields]) + problem.moved
 
 
-def support_of(surfaces: Sequence[Surface]) -> Support:
-    """Return the area of some surfaces, and the sizes of all of them together."""
+def support_of(surfaces: Sequence[Surface | Quality]) -> Support:
+    """Return the area of some surfaces, or of those of some fields, and the sizes of all of them together."""
     extent = Extent.union([surface.extent for surface in surfaces])
     return Support(np.array(sum(surface.area for surface in surfaces)), extent.widths, extent.reach)
 
