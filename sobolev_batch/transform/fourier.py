@@ -159,6 +159,18 @@ def choose_settings(
     return replace(settings, eps=min(max(eps, FINEST_EPS[settings.dtype]), COARSEST_EPS), tolerance=tolerance)
 
 
+def settings_on(
+    lattice: FrequencyLattice, surface: Surface, settings: TransformSettings | ErrorTarget
+) -> TransformSettings:
+    """Return settings as they are, or the cheapest ones with which a surface meets a target on a lattice."""
+    if isinstance(settings, TransformSettings):
+        return settings
+    if kind_of(surface).is_closed_form:
+        return TransformSettings()
+    cheapest = TransformSettings(dtype=cheapest_dtype([surface], lattice, settings))
+    return choose_settings(surface, lattice, settings, cheapest)
+
+
 @dataclass(frozen=True, eq=False)
 class Transformed:
     """A block of a field: its values, the number of quadrature points, and the library or "closed form".

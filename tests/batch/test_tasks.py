@@ -27,14 +27,13 @@ from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.norms.tail.sampling import Octave
-from sobolev_batch.norms.tail.values import settings_on
 from sobolev_batch.shapes import Similarity, icosphere
 from sobolev_batch.sources.registry import ExpectedSize
 from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import Plan, make_plan
-from sobolev_batch.transform.fourier import TransformSettings, projected_bytes
+from sobolev_batch.transform.fourier import TransformSettings, projected_bytes, settings_on
 from sobolev_batch.transform.lattice import Block, OctaveLattice
 from sobolev_batch.transform.nufft_costs import CPU_COSTS, NufftSpec, Workload, fastest_spec
 from sobolev_batch.transform.rules import gauss_rule

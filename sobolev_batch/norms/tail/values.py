@@ -12,15 +12,7 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.transform.backends import Backend
-from sobolev_batch.transform.fourier import (
-    ON_CPU,
-    ErrorTarget,
-    Execution,
-    TransformSettings,
-    cheapest_dtype,
-    choose_settings,
-    transform_block,
-)
+from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, settings_on, transform_block
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import OctaveLattice
 from sobolev_batch.transform.probe import norms_of_checks
@@ -67,7 +59,7 @@ def octave_values(
     sampling: OctaveSampling,
     orders: Sequence[float],
     settings: TransformSettings | ErrorTarget,
-    execution: Execution = ON_CPU,
+    execution: Execution,
     *,
     known: OctaveValues | None = None,
 ) -> OctaveValues:
@@ -94,18 +86,6 @@ def octave_values(
     return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders, execution.backend))
 
 
-def settings_on(
-    lattice: OctaveLattice, surface: Surface, settings: TransformSettings | ErrorTarget
-) -> TransformSettings:
-    """Return settings as they are, or the cheapest ones with which a surface meets a target on a lattice."""
-    if isinstance(settings, TransformSettings):
-        return settings
-    if kind_of(surface).is_closed_form:
-        return TransformSettings()
-    cheapest = TransformSettings(dtype=cheapest_dtype([surface], lattice, settings))
-    return choose_settings(surface, lattice, settings, cheapest)
-
-
 def _compared(
     surface: Surface, sampling: OctaveSampling, values: Complexes, orders: Sequence[float], backend: Backend
 ) -> tuple[Reals, Reals]:
@@ -113,9 +93,7 @@ def _compared(
     kind = kind_of(surface)
     count = 0 if kind.is_closed_form else int(np.clip(_PAIRS // max(kind.triangles, 1), _FEWEST_CHECKS, _MOST_CHECKS))
     chosen, scales = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for number, sample_set in enumerate(sampling.sample_sets):
-        if sample_set.is_drawn or not count:
-            continue
+    for number, sample_set in enumerate(sampling.sample_sets[:-1] if count else ()):
         weights = sampling.weights[sample_set.samples]
         # Relative to the lowest frequency, so that high powers do not all underflow.
         lengths = 1 + sampling.radii[sample_set.samples] ** 2
@@ -125,7 +103,7 @@ def _compared(
         chosen.append(sample_set.samples.start + drawn)
         scales.append(weights[drawn] / (count * chances[drawn]))
     places = np.concatenate(chosen)
-    differences = values[places] - kind.exact_values(sampling.frequencies[places], ON_CPU.threads, backend)
+    differences = values[places] - kind.exact_values(sampling.frequencies[places], backend=backend)
     return sampling.radii[places], np.concatenate(scales) * np.abs(differences) ** 2
 
 

@@ -22,7 +22,7 @@ from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling, TailSampli
 from sobolev_batch.norms.tail.values import OctaveValues, SurfaceSize, octave_values
 from sobolev_batch.shapes import Sphere, Torus, icosphere
 from sobolev_batch.transform.exact import exact_transform
-from sobolev_batch.transform.fourier import ErrorTarget, TransformSettings
+from sobolev_batch.transform.fourier import ON_CPU, ErrorTarget, TransformSettings
 from sobolev_batch.transform.lattice import OctaveLattice, smooth_step
 from sobolev_batch.transform.spheres import sphere_transform
 from tests.support.oracles import torus_value
@@ -42,7 +42,7 @@ def sampling_of(surface: Surface, seed: int, intervals: int = 16, draws: int = 2
 
 
 def values_of(surface: Surface, sampling: OctaveSampling, known: OctaveValues | None = None) -> OctaveValues:
-    return octave_values(surface, sampling, ORDERS, TARGET, known=known)
+    return octave_values(surface, sampling, ORDERS, TARGET, ON_CPU, known=known)
 
 
 def sums_of(surface: Surface, sampling: OctaveSampling) -> OctaveSums:
