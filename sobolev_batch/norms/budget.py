@@ -29,6 +29,8 @@ _WINDOWS, _OCTAVES = ((0.5, 0.75), (0.75, 1.0)), ((0.25, 0.5), (0.5, 1.0))
 # Least power by which the energy grows below half of its ceiling, and the largest one. On a given lattice nothing but
 # this law tells what lies beyond. With an accuracy, more is measured there.
 _POWERS, _POWERS_IF_GIVEN = (1.0, 4.0), (2.0, 32.0)
+# Surfaces end this much short of the period.
+_CLEARANCE = 1.001
 
 _CUBE = np.array(list(product(range(-3, 4), repeat=3)), dtype=np.float64)
 _ODD_ENTRIES = (np.abs(_CUBE) % 2).sum(axis=1)
@@ -80,6 +82,11 @@ class Support:
     areas: Reals
     widths: Reals
     reach: float = 0.0
+
+    @property
+    def least_period(self) -> float:
+        """Least period 1/h of a lattice that holds the surfaces."""
+        return _CLEARANCE * 2 * self.reach
 
 
 def add_sums(sums: Sequence[Sums]) -> Sums:

@@ -16,14 +16,7 @@ from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import ESTIMATE_CAUTION, Problem, error_target, only_or_difference, sums_on
 from sobolev_batch.norms.accuracy.solution import Solution, SurfaceValues
-from sobolev_batch.norms.accuracy.tolerance import (
-    LEAST_CLEARANCE,
-    LEAST_OF_OCTAVES,
-    Accuracy,
-    first_lattice,
-    lattice_of,
-    refined,
-)
+from sobolev_batch.norms.accuracy.tolerance import LEAST_OF_OCTAVES, Accuracy, first_lattice, lattice_of, refined
 from sobolev_batch.norms.bounds import modulus_bound
 from sobolev_batch.norms.budget import Sums
 from sobolev_batch.norms.estimate import NormEstimate, estimate_norms
@@ -254,7 +247,7 @@ def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool
     if np.all(np.isfinite(certain)):
         farther, quick = needed(certain, permitted(_NEGLIGIBLE), powers - 2), min(_quick_intervals(problem), largest)
         # The largest spacing on which surfaces fit and no peak is missed: squares have twice the bandwidth.
-        room = max(2 * float(problem.support.widths.max()), LEAST_CLEARANCE * 2 * problem.support.reach)
+        room = max(2 * float(problem.support.widths.max()), problem.support.least_period)
         sparse = lattice_of(farther, room, LARGEST_M)
         if quick >= sparse.M:
             bound = _bound_up_to(problem, lattice, sparse, permitted(_OF_VALUES))

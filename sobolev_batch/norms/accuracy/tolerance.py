@@ -40,8 +40,6 @@ _IMAGE_MARGIN, _TAIL_MARGIN = 150.0, 2.0
 # If those laws ask for more than this, a pilot lattice of this size measures the pair first.
 _PILOT_M = 64
 _HIGHEST_FREQUENCY = 1e4
-# Surfaces end this much short of the period.
-LEAST_CLEARANCE = 1.001
 # Surfaces may be as small as a point, but the kernel is a unit of length wide.
 _LEAST_WIDTH = 0.01
 # An accuracy called reachable must hold when it is requested, on a pilot that differs a little.
@@ -241,7 +239,7 @@ def _first_period(support: Support, orders: Sequence[float], accuracy: Accuracy)
         farthest = period > widest + _VANISHED
         return farthest or all(budget.image_weight(1 / period, order, widths) <= allowed for order in orders)
 
-    return max(next(filter(suffices, _growing(max(widest, _LEAST_WIDTH)))), LEAST_CLEARANCE * 2 * support.reach)
+    return max(next(filter(suffices, _growing(max(widest, _LEAST_WIDTH)))), support.least_period)
 
 
 def _growing(first: float, factor: float = 1.01) -> Iterator[float]:
