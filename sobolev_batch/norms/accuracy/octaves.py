@@ -81,14 +81,14 @@ class Core:
     errors: Reals
 
     @classmethod
-    def on_lattice(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
-        """Compute the fields of a problem on a lattice."""
+    def on_lattice(cls, problem: Problem, lattice: Lattice) -> Self:
+        """Compute the fields of a problem on a lattice, at whose end the step ends."""
         values = problem.accuracy.scale(ESTIMATE_CAUTION * estimate_from(problem.samples(lattice), problem.orders))
         problem.require_above_rounding(values)
         # The octaves' values have errors of their own.
         target = error_target(values, problem.orders, problem.accuracy, problem.area)
         fields = problem.fields(lattice, target.tightened(2 * problem.inexact_count))
-        weights = SobolevWeights(lattice, problem.orders, cutoff)
+        weights = SobolevWeights(lattice, problem.orders, lattice.xi_max)
         return cls(weights, fields, *sums_on(problem, fields, weights))
 
     @property
@@ -103,11 +103,6 @@ class MeasuredOctave:
 
     values: tuple[OctaveValues, ...]
     sums: OctaveSums
-
-    @property
-    def sampling(self) -> OctaveSampling:
-        """Samples of the octave, common to all surfaces."""
-        return self.values[0].sampling
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,19 +125,6 @@ class State:
     for_others: bool = False
     seconds: float = 0.0
     steps: int = 0
-
-    @classmethod
-    def first(cls, problem: Problem, seed: int, for_others: bool) -> Self:
-        """Return what a small lattice shows, and what lies beyond it."""
-        lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
-        core = Core.on_lattice(problem, lattice, lattice.xi_max)
-        beyond = Remainder.unknown(lattice.xi_max) if for_others else problem.beyond(lattice.xi_max, seed)
-        return cls(problem, seed, core, (), (beyond,), for_others, beyond.seconds(beyond.points))
-
-    @property
-    def cutoff(self) -> float:
-        """Radius |ξ| at which the step of the core ends, in cycles per unit length."""
-        return self.remainders[0].cutoff
 
     @cached_property
     def tail(self) -> Tail:
@@ -266,7 +248,10 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: 
     """
     aimed = problem.with_rtol(aim * problem.accuracy.rtol)
     problem.notify(f"{problem.label}: octaves beyond a lattice")
-    state = State.first(aimed, seed, for_others)
+    lattice = core_lattice(aimed.support, aimed.orders, aimed.accuracy)
+    core = Core.on_lattice(aimed, lattice)
+    beyond = Remainder.unknown(lattice.xi_max) if for_others else aimed.beyond(lattice.xi_max, seed)
+    state = State(aimed, seed, core, (), (beyond,), for_others, beyond.seconds(beyond.points))
     for _ in range(_ROUNDS):
         while (farther := farther_out(state)) is not None:
             state = farther
@@ -300,7 +285,7 @@ def farther_out(state: State) -> State | None:
     needs_octave = state.for_others and bool(state.normals) and not state.octaves
     if (state.excess <= 1 and not needs_octave) or state.seconds >= _MOST_SECONDS:
         return _looked_at(state)
-    octave = Octave(state.cutoff, len(state.octaves) + 1)
+    octave = Octave(state.remainders[0].cutoff, len(state.octaves) + 1)
     smooth = max((surface.area for surface in problem.surfaces if isinstance(surface, Smooth)), default=0.0)
     # The nodes of surfaces by formula resolve no more.
     highest = np.sqrt(_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * smooth)) if smooth else np.inf
@@ -338,9 +323,9 @@ def refined(state: State) -> State | None:
     if np.any(change_of_root(state.squares, images) > accuracy.aliasing_part * values):
         larger = good_intervals(FINER_LATTICE * lattice.M)
         if larger <= accuracy.largest_intervals:
-            core = Core.on_lattice(problem, Lattice(lattice.xi_max, larger), state.cutoff)
+            core = Core.on_lattice(problem, Lattice(lattice.xi_max, larger))
     finer = _finer_samplings(state)
-    seconds = sum(state.sampling_seconds(sampling, state.octaves[n].sampling) for n, sampling in finer.items())
+    seconds = sum(state.sampling_seconds(one, state.octaves[n].values[0].sampling) for n, one in finer.items())
     if state.seconds + seconds > _MOST_SECONDS:
         finer, seconds = {}, 0.0
     if core is state.core and not finer:
@@ -430,7 +415,7 @@ def _finer_samplings(state: State) -> dict[int, OctaveSampling]:
 
 def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling:
     """Return a sampling of an octave with a smaller variance."""
-    sampling, sums = octave.sampling, octave.sums
+    sampling, sums = octave.values[0].sampling, octave.sums
     rng = np.random.default_rng([state.seed, state.steps, sampling.octave.index])
     excess = float(sums.variances[order]) / permitted
     count = int(min(sampling.draws * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
