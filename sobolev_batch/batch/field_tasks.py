@@ -231,7 +231,7 @@ def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
     if job.reference is None or job.tail is not None:
         return None
     if job.reference.label == job.planned.label:
-        return Remainder.between(0.0, 0.0, cutoff)
+        return Remainder.alike(cutoff)
     reference = job.load_reference()
     return None if reference is None else remainder_of_flat((surface, reference), cutoff, execution=job.execution)
 

@@ -434,7 +434,7 @@ class Evaluator:
         limit, most = (np.interp(self.orders, _AT_ORDERS, values) for values in (_LEAST_LIMITS, _MOST))
         lowest = np.minimum(limit * last, min(2 * last - total, total, max(total - _SWING * (last - total), least)))
         highest = np.minimum(np.maximum(most * total, total + swing), largest)
-        unit, off = Remainder.between(1.0, 1.0, cutoff).at(self.orders)
+        unit, off = Remainder.alike(cutoff, 1.0).at(self.orders)
         lower, upper = np.maximum(lowest, 0.0) * (unit - off), highest * (unit + off)
         if self._from_reference.keys() >= {row, other}:
             known = self._from_reference[row], self._from_reference[other]

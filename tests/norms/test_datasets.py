@@ -52,7 +52,7 @@ def test_what_is_no_quality_of_a_field_is_damage(place: int, entry: object) -> N
 
 
 def test_errors_beside_a_field_of_unknown_quality_are_all_unknown() -> None:
-    quality = replace(Quality.from_json(A.attrs["quality"]), beyond=Remainder.between(0.0, 1.0, 2.0))
+    quality = replace(Quality.from_json(A.attrs["quality"]), beyond=Remainder.alike(2.0, 0.5, 0.5))
     found = distance(A.assign_attrs(quality=quality.to_json()), (2 * A).drop_attrs(), -2.0)
     assert found["error_part"].isnull().all()
 

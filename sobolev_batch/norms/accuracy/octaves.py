@@ -250,7 +250,7 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: 
     problem.notify(f"{problem.label}: octaves beyond a lattice")
     lattice = core_lattice(aimed.support, aimed.orders, aimed.accuracy)
     core = Core.on_lattice(aimed, lattice)
-    beyond = Remainder.unknown(lattice.xi_max) if for_others else aimed.beyond(lattice.xi_max, seed)
+    beyond = Remainder.alike(lattice.xi_max, error=np.inf) if for_others else aimed.beyond(lattice.xi_max, seed)
     state = State(aimed, seed, core, (), (beyond,), for_others, beyond.seconds(beyond.points))
     for _ in range(_ROUNDS):
         while (farther := farther_out(state)) is not None:
@@ -306,7 +306,8 @@ def farther_out(state: State) -> State | None:
     if sampling is None:
         return _looked_at(state)
     measured = _measured(state, sampling)
-    outer = Remainder.unknown(octave.highest) if state.for_others else problem.beyond(octave.highest, state.seed)
+    unknown = Remainder.alike(octave.highest, error=np.inf)
+    outer = unknown if state.for_others else problem.beyond(octave.highest, state.seed)
     return state.advanced(seconds, octaves=(*state.octaves, measured), remainders=(*state.remainders, outer))
 
 

@@ -108,14 +108,9 @@ class Remainder:
     excesses: tuple[tuple[float, ...], ...] = ((), ())
 
     @classmethod
-    def between(cls, lowest: float, highest: float, cutoff: float) -> Self:
-        """Return a part whose mean energy lies between bounds."""
-        return cls(cutoff, (-1.0,), ((lowest + highest) / 2,), (abs(highest - lowest) / 2,))
-
-    @classmethod
-    def unknown(cls, cutoff: float) -> Self:
-        """Return a part that nobody has looked at."""
-        return cls(cutoff, (-1.0,), (0.0,), (np.inf,))
+    def alike(cls, cutoff: float, energy: float = 0.0, error: float = 0.0) -> Self:
+        """Return a part with one mean energy for all orders; its error is infinite where nobody has looked at it."""
+        return cls(cutoff, (-1.0,), (energy,), (error,))
 
     @property
     def is_known(self) -> bool:
@@ -226,7 +221,7 @@ def remainder_between(
     if rests := without_common_parts(pair):
         found = remainder(list(rests.values()), list(rests), cutoff, orders, execution=execution, is_bound=is_bound)
         return replace(found, excesses=((), ()))
-    return Remainder.between(0.0, 0.0, cutoff)
+    return Remainder.alike(cutoff)
 
 
 def remainder_of_flat(
