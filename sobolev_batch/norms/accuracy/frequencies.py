@@ -109,10 +109,6 @@ class Frequencies:
 
         return by
 
-    def errors(self, values: Sequence[SurfaceValues]) -> Reals:
-        """Return the norms of the own errors (orders,) of all values together."""
-        return np.asarray(np.hypot.reduce([one.error_norms(self.weights) for one in values]))
-
     def norms_of(self, measure: Measure, surfaces: Sequence[Surface], errors: Reals, tail: Tail | None) -> NormEstimate:
         """Return the norms of a measure from its tail and the norms of its values' own errors (orders,)."""
         support = Support(support_of(surfaces).areas, self.widths)
@@ -155,8 +151,9 @@ class Frequencies:
         beyond = (known or self._beyond(surfaces, signs)) if self.has_tail else None
         of_difference = self.tail(a_minus_b, surfaces, signs, beyond)
         of_b = self.tail(b, pair[1:], [1])
-        norms = self.norms_of(b, pair[1:], self.errors([reference]), of_b)
-        distances = self.norms_of(a_minus_b, surfaces, self.errors(difference) + problem.moved, of_difference)
+        norms = self.norms_of(b, pair[1:], reference.error_norms(self.weights), of_b)
+        errors = np.hypot.reduce([one.error_norms(self.weights) for one in difference]) + problem.moved
+        distances = self.norms_of(a_minus_b, surfaces, errors, of_difference)
         tails = self.tail(a, pair[:1], [1]), of_b, of_difference
         products, tail = self.lattice_sums(a_minus_b, b), Tail.of_product(self.octave_integral(a_minus_b, b), *tails)
         if beyond is not None and tail is not None and problem.is_whole:
