@@ -218,23 +218,18 @@ class Problem:
             worst = int(np.argmax(below * floor / (parts * np.maximum(values, floor))))
             rtol = self.accuracy.rtol
             reachable = 2 * rtol * floor / float(parts[worst] * values[worst])
-            raise AccuracyError(
+            problem = (
                 f"{self.label}: rtol {rtol:g} of about {values[worst]:.2g} at order {self.orders[worst]:g} is below "
-                f"the rounding of double precision; about {reachable:.1g} can be reached; ask for that, or for a best "
-                "effort",
-                rtol,
-                reachable,
+                f"the rounding of double precision; about {reachable:.1g} can be reached; ask for that or a best effort"
             )
+            raise AccuracyError(problem, rtol, reachable)
 
     def out_of_reach(self, found: NormEstimate, limits: str = _BY_TIME) -> AccuracyError:
         """Return the error for an accuracy out of reach, from the nearest that was reached and what limits it."""
         relative = found.errors / found.values
         worst = int(np.argmax(relative))
-        return unreachable(
-            f"{self.label}: rtol {self.accuracy.rtol:g} is out of reach at order {self.orders[worst]:g} {limits}",
-            self.accuracy.rtol,
-            _REACHABLE_MARGIN * float(relative[worst]),
-        )
+        reachable = _REACHABLE_MARGIN * float(relative[worst])
+        return unreachable(self.label, self.orders[worst], limits, self.accuracy.rtol, reachable)
 
 
 def error_target(values: Reals, orders: tuple[float, ...], accuracy: Accuracy, area: float) -> ErrorTarget:

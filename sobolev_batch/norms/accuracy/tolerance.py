@@ -109,8 +109,8 @@ class Accuracy:
         return candidates[fitting - 1]
 
 
-def unreachable(problem: str, rtol: float, reachable: float) -> AccuracyError:
-    """Return the error for an rtol that is out of reach, with advice by the smallest one that is not."""
+def unreachable(label: str, order: float, limits: str, rtol: float, reachable: float) -> AccuracyError:
+    """Return the error for an rtol that is out of reach by some limits, with advice by the smallest one that is not."""
     found, advice = "not even one digit can be reached", "take a more negative order, or a best effort"
     if reachable < 1:
         # An estimate has two digits; up, so that it is met.
@@ -120,6 +120,7 @@ def unreachable(problem: str, rtol: float, reachable: float) -> AccuracyError:
         advice = "ask for that or for a best effort, or take a more negative order"
     if rtol < LEAST_OF_OCTAVES < reachable:
         found += f" on one lattice; an rtol from {LEAST_OF_OCTAVES:g} on permits octaves, which may reach more"
+    problem = f"{label}: rtol {rtol:g} is out of reach at order {order:g} {limits}"
     return AccuracyError(f"{problem}; {found}; {advice}", rtol, reachable)
 
 
@@ -196,12 +197,9 @@ def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Acc
     if highest is None:
         excess = tail(max(most / (2 * period), lattice.xi_max)) / allowed
         worst = int(np.argmax(excess))
-        raise unreachable(
-            f"{label}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g} within "
-            f"{accuracy.allowed_bytes / 1e9:.3g} GB of memory (M <= {most}; more memory permits a larger one)",
-            accuracy.rtol,
-            _REACHABLE_MARGIN * float(excess[worst]) * accuracy.rtol,
-        )
+        reachable = _REACHABLE_MARGIN * float(excess[worst]) * accuracy.rtol
+        limits = f"within {accuracy.allowed_bytes / 1e9:.3g} GB of memory (M <= {most}; more permits a larger one)"
+        raise unreachable(label, orders[worst], limits, accuracy.rtol, reachable)
     return lattice_of(highest, period, most)
 
 
