@@ -258,10 +258,8 @@ def field_of(
             raise LatticeError(f"a field has the dimensions {', '.join(AXES)} alone, found {a.dims}: select one mesh")
         return a
     if lattice is None:
-        raise InputError(
-            f"a surface such as this {type(a).__name__} needs a lattice or an accuracy: "
-            "pass rtol, such as 1e-2, to a norm or distance, or lattice=Lattice(xi_max=..., M=...)"
-        )
+        found = type(a).__name__
+        raise InputError(f"this {found} needs a lattice=Lattice(xi_max=..., M=...) or, in norms and distances, an rtol")
     return fourier_transform(a, lattice, eps, order=orders)
 
 
