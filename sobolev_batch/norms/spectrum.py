@@ -144,8 +144,7 @@ class _Segment:
         # A sample on a node takes that node's value: any tiny difference says so.
         differences[differences == 0] = np.finfo(np.float64).tiny
         matrix = _POINT_WEIGHTS / differences
-        matrix /= matrix.sum(axis=1, keepdims=True)
-        return np.asarray(matrix)
+        return np.asarray(matrix / matrix.sum(axis=1, keepdims=True))
 
     @cached_property
     def peak_weights(self) -> Reals:

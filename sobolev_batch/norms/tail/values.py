@@ -147,10 +147,8 @@ class SurfaceSize:
 
         The known one has some of the same lattices, from the first on, and maybe the same drawn frequencies.
         """
-        lattices, draws = sampling.lattices, sampling.draws
-        if known is not None:
-            lattices = lattices[len(known.lattices) :]
-            draws = 0 if sampling.drawn_by == known.drawn_by else draws
+        lattices = sampling.lattices if known is None else sampling.lattices[len(known.lattices) :]
+        draws = 0 if known is not None and sampling.drawn_by == known.drawn_by else sampling.draws
         return sum(map(self.lattice_seconds, lattices)) + draws * self.draw_seconds
 
     def _nufft_seconds(self, lattice: OctaveLattice) -> float:
