@@ -7,7 +7,7 @@ number; discretisation comes from the fields (`transform/probe`). docs/numerics.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.special import exprel, gammaln
@@ -43,8 +43,7 @@ _SUBLATTICES: tuple[tuple[list[int], int, Reals], ...] = (
 )
 
 
-@dataclass(frozen=True)
-class Sums:
+class Sums(NamedTuple):
     """Sums of squared fields: enough for their norms of each order and the errors of these.
 
     Attributes:
@@ -62,11 +61,6 @@ class Sums:
     def zeros(cls, orders: int, *shape: int) -> Self:
         """Return sums of zero for fields of a shape."""
         return cls(np.zeros((orders, *shape)), np.zeros((orders, 4, *shape)), np.zeros((2, *shape)))
-
-    @property
-    def arrays(self) -> tuple[Reals, Reals, Reals]:
-        """All sums."""
-        return self.totals, self.by_residue, self.outer
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +85,7 @@ class Support:
 
 def add_sums(sums: Sequence[Sums]) -> Sums:
     """Return the sums of a whole field from those of its blocks."""
-    return Sums(*(np.sum(parts, axis=0) for parts in zip(*(one.arrays for one in sums), strict=True)))
+    return Sums(*(np.sum(parts, axis=0) for parts in zip(*sums, strict=True)))
 
 
 def sums_of_shells(shell_sums: Reals, weights: SobolevWeights) -> Sums:

@@ -134,7 +134,7 @@ def differences(products: Sums, first: Sums, second: Sums) -> tuple[Sums, NDArra
     The products are those of the differences to the center, in arrays that end in (m, n). The others are squares of
     these, and end in (m,) and (n,). The mask (m, n) is True for pairs that lost more than some six digits at any order.
     """
-    scales = [a[..., :, None] + b[..., None, :] for a, b in zip(first.arrays, second.arrays, strict=True)]
-    squares = Sums(*(scale - 2 * both for scale, both in zip(scales, products.arrays, strict=True)))
+    scales = [a[..., :, None] + b[..., None, :] for a, b in zip(first, second, strict=True)]
+    squares = Sums(*(scale - 2 * both for scale, both in zip(scales, products, strict=True)))
     cancelled: NDArray[np.bool_] = np.any(squares.totals <= _CANCELLATION * scales[0], axis=0)
-    return replace(squares, outer=np.maximum(squares.outer, 0.0)), cancelled
+    return squares._replace(outer=np.maximum(squares.outer, 0.0)), cancelled

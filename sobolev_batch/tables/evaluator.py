@@ -297,10 +297,10 @@ class Evaluator:
             pair = rows[i], others[j]
             shells = np.zeros(self.lattice.shell_count) if pair[0] == pair[1] else self.sums_over_shells(pair)
             direct = sums_of_shells(shells, self.weights)
-            for array, found in zip(sums.arrays, direct.arrays, strict=True):
+            for array, found in zip(sums, direct, strict=True):
                 array[..., i, j] = found
         if shared:
-            for array in sums.arrays:
+            for array in sums:
                 square = np.triu(array[..., :shared])
                 array[..., :shared] = square + np.swapaxes(np.triu(square, 1), -1, -2)
         areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
@@ -360,9 +360,9 @@ class Evaluator:
         products, right = (Sums.zeros(len(self.orders), *shape, len(others)) for shape in ((len(rows),), ()))
 
         def multiply(group: slice, fields: Complexes, above: int) -> None:
-            for array, found in zip(products.arrays, arrangement.products(held[:above], fields).arrays, strict=True):
+            for array, found in zip(products, arrangement.products(held[:above], fields), strict=True):
                 array[..., :above, group] = found
-            for array, found in zip(right.arrays, arrangement.squares(fields).arrays, strict=True):
+            for array, found in zip(right, arrangement.squares(fields), strict=True):
                 array[..., group] = found
 
         for group in slices(shared, self._group):

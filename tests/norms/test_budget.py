@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -239,7 +238,7 @@ def test_energies_that_hardly_grow_have_a_bound(growth: float) -> None:
     sums = Sums(np.ones((2, 1)), np.ones((2, 4, 1)), np.array([[1.5 / (1 + growth)], [1.5]]))
     weights, support = SobolevWeights(lattice, (-2.0, -0.6)), Support(np.ones(1), np.full(13, 2.0))
     bound = truncated(sums, weights, support)
-    flat = truncated(replace(sums, outer=np.full((2, 1), 1.5)), weights, support)
+    flat = truncated(sums._replace(outer=np.full((2, 1), 1.5)), weights, support)
     assert bound == pytest.approx(flat, rel=0.3)
 
 
@@ -285,7 +284,7 @@ def test_norms_below_their_errors_give_no_relative_error() -> None:
 
 def test_errors_of_one_square_change_its_root_together() -> None:
     lattice = Lattice(2.0, 8)
-    sums = replace(Sums.zeros(1), totals=np.array([0.2]))
+    sums = Sums.zeros(1)._replace(totals=np.array([0.2]))
     tail = Tail(*(np.array([part]) for part in (0.3, 0.45, 0.5, 0.45)))
     found = estimate_norms(
         sums, SobolevWeights(lattice, (-2.0,), 2.0), Support(np.ones(()), np.ones(13)), np.zeros(1), tail
