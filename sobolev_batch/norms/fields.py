@@ -282,8 +282,7 @@ def pair_of(
 def common_lattice(operands: Sequence[OperandLike], lattice: Lattice | None) -> Lattice | None:
     """Return the lattice of the fields among operands, else the given one or None; LatticeError where they differ."""
     lattices = [Lattice.from_field(x) for x in operands if isinstance(x, xr.DataArray)]
-    if lattice is not None:
-        lattices.append(check_lattice(lattice))
+    lattices += [] if lattice is None else [check_lattice(lattice)]
     for other in lattices[1:]:
         if other.M != lattices[0].M or not np.isclose(other.xi_max, lattices[0].xi_max, rtol=1e-12, atol=0):
             raise LatticeError(f"fields on different lattices cannot be compared: {lattices[0]} and {other}")

@@ -210,11 +210,10 @@ class Problem:
 
     def require_above_rounding(self, values: Reals) -> None:
         """Refuse an accuracy of norms (orders,) below the rounding of fields, unless it is a best effort."""
-        if self.accuracy.best_effort:
-            return
         parts, floor = self.accuracy.discretisation_parts(self.orders), self.rounding
         # A distance of no more than rounding is that of near-duplicates, and has no relative accuracy.
-        if (below := (parts * values < floor) & (values > floor)).any():
+        below = (parts * values < floor) & (values > floor)
+        if below.any() and not self.accuracy.best_effort:
             worst = int(np.argmax(below * floor / (parts * np.maximum(values, floor))))
             rtol = self.accuracy.rtol
             reachable = 2 * rtol * floor / float(parts[worst] * values[worst])

@@ -65,8 +65,7 @@ class Solution:
 
         The product of both surfaces does not exceed `apart` (orders,); what it may change is an error by images.
         """
-        norms = np.stack([one.estimate.values for one in alone])
-        errors = np.stack([one.estimate.errors for one in alone])
+        norms, errors = np.stack([(one.estimate.values, one.estimate.errors) for one in alone], axis=1)
         values, highest = np.hypot(*norms), np.hypot(*(norms + errors))
         # Each error is weighted such that all of them together lead from the values to the highest ones.
         weights = (2 * norms + errors) / (highest + values)

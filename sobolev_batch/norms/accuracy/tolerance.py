@@ -191,9 +191,8 @@ def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Acc
     most, allowed = accuracy.largest_intervals, accuracy.truncation_parts(orders)
     larger = _growing(lattice.xi_max, _STEP)
     candidates = [next(larger), *takewhile(lambda highest: 2 * highest * period <= most, larger)]
-    highest = next((highest for highest in candidates if not np.any(tail(highest) > allowed)), None)
-    if highest is None and accuracy.best_effort:
-        return lattice_of(_HIGHEST_FREQUENCY, period, most)
+    nearest = _HIGHEST_FREQUENCY if accuracy.best_effort else None
+    highest = next((highest for highest in candidates if not np.any(tail(highest) > allowed)), nearest)
     if highest is None:
         excess = tail(max(most / (2 * period), lattice.xi_max)) / allowed
         worst = int(np.argmax(excess))
