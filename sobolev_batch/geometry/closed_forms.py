@@ -99,10 +99,8 @@ class Ellipsoid(Smooth):
         shortest = 1 / LARGEST_LENGTH
         axes = checked_point(self.axes, "an ellipsoid's semi-axes")
         if not all(shortest <= a <= LARGEST_LENGTH for a in axes):
-            raise InputError(
-                f"an ellipsoid's semi-axes must be three numbers between {shortest:g} and {LARGEST_LENGTH:g}, "
-                f"found {self.axes}"
-            )
+            limits = f"between {shortest:g} and {LARGEST_LENGTH:g}"
+            raise InputError(f"an ellipsoid's semi-axes must be three numbers {limits}, found {self.axes}")
         vars(self).update(axes=axes, center=checked_point(self.center, "an ellipsoid's center"))
 
     @property
@@ -182,9 +180,7 @@ class Torus(Smooth):
 
     def __post_init__(self) -> None:
         if not (is_finite_number(self.R) and is_finite_number(self.r) and 0 < self.r < float(self.R) <= LARGEST_LENGTH):
-            raise InputError(
-                f"a torus needs radii with 0 < r < R, R at most {LARGEST_LENGTH:g}, found R = {self.R} and r = {self.r}"
-            )
+            raise InputError(f"a torus needs 0 < r < R, R at most {LARGEST_LENGTH:g}, found R = {self.R}, r = {self.r}")
         vars(self).update(R=float(self.R), r=float(self.r), center=checked_point(self.center, "a torus's center"))
 
     @property

@@ -81,15 +81,10 @@ class Mesh:
     def _require_sizes(self) -> None:
         largest = float(np.abs(self.vertices).max(initial=0.0))
         if largest > LARGEST_LENGTH or not np.isfinite(self.area):
-            raise MeshError(
-                "the mesh has coordinates so large that areas or squared lengths overflow double precision: "
-                f"largest absolute coordinate {largest:.3g}; rescale it"
-            )
+            raise MeshError(f"areas or squared lengths overflow: largest absolute coordinate {largest:.3g}; rescale it")
         if self._sizes.without_area == len(self.triangles):
-            raise MeshError(
-                f"the total area of the {len(self.triangles)} triangles is zero: every one is degenerate, or too small "
-                "for double precision, so there is no surface measure to compare"
-            )
+            total = f"the total area of the {len(self.triangles)} triangles is zero"
+            raise MeshError(f"{total}: every one is degenerate, or too small for double precision; rescale the mesh")
 
     @classmethod
     def from_checked(cls, vertices: Reals, triangles: Indices, notes: tuple[str, ...] = ()) -> Mesh:
@@ -483,9 +478,8 @@ def _checked_triangles(triangles: ArrayLike, vertex_count: int) -> Indices:
         raise MeshError(f"triangles must have shape (m, 3), found {array.shape}")
     if array.min() < 0 or array.max() >= vertex_count:
         bad = np.flatnonzero(((array < 0) | (array >= vertex_count)).any(axis=1))
-        raise MeshError(
-            f"{bad.size} of {len(array)} triangles have indices outside 0..{vertex_count - 1}: {_listed(bad, array)}"
-        )
+        outside = f"indices outside 0..{vertex_count - 1}: {_listed(bad, array)}"
+        raise MeshError(f"{bad.size} of {len(array)} triangles have {outside}")
     return _frozen(_owned(array, np.int64))
 
 

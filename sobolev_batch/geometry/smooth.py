@@ -165,10 +165,8 @@ class Smooth(ABC):
         if not (math.isfinite(area) and area > 0):
             raise InputError(f"a surface needs an area that is positive and finite, found {area:g}")
         if change > _UNSETTLED * area:
-            raise InputError(
-                f"the area of the surface changes from {before:.6g} to {area:.6g} when the nodes are doubled to "
-                f"{counts[0]} x {counts[1]}: its parametrisation is not smooth, or oscillates too fast"
-            )
+            both = f"{before:.6g} and, with twice the nodes, {area:.6g}"
+            raise InputError(f"the area of the surface seems to be {both}: it is not smooth, or oscillates too fast")
         return area
 
     def _area(self, counts: Counts) -> float:
@@ -351,10 +349,8 @@ def _vectors(returned: object, shape: tuple[int, ...]) -> Reals:
     except (TypeError, ValueError) as error:
         parts: Sequence[Any] = returned if isinstance(returned, tuple | list) else [returned]
         kinds = ", ".join(f"{getattr(part, 'dtype', type(part).__name__)} {np.shape(part)}" for part in parts[:4])
-        raise InputError(
-            f"position must return three arrays of real numbers in the shape of u and v, {shape}, "
-            f"found {len(parts)}: {kinds}"
-        ) from error
+        expected = f"three arrays of real numbers in the shape of u and v, {shape}"
+        raise InputError(f"position must return {expected}, found {len(parts)}: {kinds}") from error
     if not np.isfinite(vectors).all():
         raise InputError("position is not finite everywhere on the surface")
     return vectors

@@ -97,9 +97,8 @@ class RemesherSource(NestedSource, KeepingSource):
         for name, value in self.parameters.items():
             values = value if isinstance(value, list | tuple) else [value]
             if not values or not all(isinstance(entry, Parameter) for entry in values):
-                raise ValueError(
-                    f"{name} must be a number, a text, true, false or a list of them, found {quoted(value)}"
-                )
+                allowed = "a number, a text, true, false or a list of them"
+                raise ValueError(f"{name} must be {allowed}, found {quoted(value)}")
             count *= len(values)
         if count > MOST_ENTRIES:
             raise ValueError(f"at most {MOST_ENTRIES} meshes are allowed, and its lists make {count}")
@@ -162,10 +161,8 @@ class CommandSource(RemesherSource):
         if unknown := sorted(asked - known):
             raise ValueError(f"the command has {{{unknown[0]}}}, and no parameter has this name")
         if unused := sorted(known - asked - {_FOLDER, INPUT, OUTPUT}):
-            keys = ", ".join(name for name in type(self).model_fields)
-            raise ValueError(
-                f"{unused[0]} is unknown: it is no key ({keys}), and the command has no {{{unused[0]}}} for it"
-            )
+            name, keys = unused[0], ", ".join(type(self).model_fields)
+            raise ValueError(f"{name} is unknown: it is no key ({keys}), and the command has no {{{name}}} for it")
         if OUTPUT not in asked:
             raise ValueError("the command has no {output}, the file that it has to write")
         return self
@@ -246,10 +243,8 @@ class RemeshedMember(Member):
         if (mesh := self.cache.read(digest)) is not None:
             return mesh
         if not self.cache.may_run:
-            raise MeshError(
-                f"the remesher may not run, and its mesh is not kept in {self.cache.folder}; run the study with "
-                "--allow-commands (in Python: allow_commands=True) if you trust it"
-            )
+            not_kept = f"the remesher may not run, and its mesh is not kept in {self.cache.folder}"
+            raise MeshError(f"{not_kept}; if you trust it, run with --allow-commands (in Python: allow_commands=True)")
         made = self.make(load_mesh(self.original))
         if self.fingerprint_digest() != digest:
             raise MeshError("a file of it was changed while it was made; run the study again")
@@ -300,10 +295,8 @@ def function_version(function: Callable[..., Any] | str) -> str:
     try:
         return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()  # type: ignore[arg-type]
     except (OSError, TypeError) as error:
-        raise StudyError(
-            f'the source of {function_name(function)} is not at hand; give "version", a text that changes whenever it '
-            "makes other meshes"
-        ) from error
+        hint = 'give "version", a text that changes whenever it makes other meshes'
+        raise StudyError(f"the source of {function_name(function)} is not at hand; {hint}") from error
 
 
 def _as_text(value: Parameter) -> str:

@@ -108,10 +108,8 @@ class DecimateSource(_ReducingSource):
 
 
 def _reduced(mesh: Mesh, reduce: Callable[[Mesh, int], Mesh], triangles: int, radius: float | None) -> Mesh:
-    if triangles >= len(mesh.triangles):
-        raise MeshError(
-            f"the mesh has {len(mesh.triangles)} triangles and cannot be reduced to {triangles}: choose fewer"
-        )
+    if triangles >= (count := len(mesh.triangles)):
+        raise MeshError(f"the mesh has {count} triangles and cannot be reduced to {triangles}: choose fewer")
     if radius is None:
         return reduce(mesh, triangles)
     center, own = mesh.bounding_sphere
@@ -161,18 +159,14 @@ def _first_vertices(surface: Mesh, sphere: Mesh, level: int) -> Mesh:
     """Take the vertices of a level from a surface, and its triangles from the hull of its map to the sphere."""
     count = 10 * 4**level + 2
     if len(surface.vertices) != len(sphere.vertices) or count > len(surface.vertices):
-        raise MeshError(
-            f"level {level} needs the first {count} vertices of a surface and of its map to the sphere, "
-            f"found {len(surface.vertices)} and {len(sphere.vertices)}"
-        )
+        needed = f"the first {count} vertices of a surface and of its map to the sphere"
+        raise MeshError(f"level {level} needs {needed}, found {len(surface.vertices)} and {len(sphere.vertices)}")
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(sphere.vertices[:count] - sphere.vertices[:count].mean(axis=0))
-    if len(hull.simplices) != 2 * count - 4:
-        raise MeshError(
-            f"the first {count} vertices of the map to the sphere are not in convex position: their hull has "
-            f"{len(hull.simplices)} triangles, expected {2 * count - 4}"
-        )
+    if (found := len(hull.simplices)) != (expected := 2 * count - 4):
+        first = f"the first {count} vertices of the map to the sphere"
+        raise MeshError(f"{first} are not in convex position: their hull has {found} triangles, expected {expected}")
     return Mesh(surface.vertices[:count], hull.simplices.astype(np.int64))
 
 

@@ -58,9 +58,7 @@ def checked_list(value: object) -> str | tuple[MeshTable, ...] | None:
     if value is None or (isinstance(value, str) and value):
         return value
     if not isinstance(value, list | tuple) or not value or not all(isinstance(table, Mapping) for table in value):
-        raise ValueError(
-            f'must be the path of a CSV file, such as "meshes.csv", or a list of tables such as {_EXAMPLE}'
-        )
+        raise ValueError(f'must be the path of a CSV file, such as "meshes.csv", or a list of tables as {_EXAMPLE}')
     return _listed(value)
 
 
@@ -179,9 +177,7 @@ class FileSource(Source):
     @model_validator(mode="after")
     def _paths_or_meshes(self) -> Self:
         if (self.paths is None) == (self.meshes is None):
-            raise ValueError(
-                'either paths, such as ["a.ply", "scans/*.obj"], or a list of meshes is needed, and not both'
-            )
+            raise ValueError('either paths, such as ["a.ply", "*.obj"], or a list of meshes is needed, and not both')
         if self.meshes is not None and (self.distribution is not None or self.times is not None):
             raise ValueError("distribution and times belong to paths; a list of meshes gives each its time")
         return self
@@ -245,9 +241,7 @@ def _recorded_file(name: str, path: str) -> Path:
     try:
         recorded = distribution(name).files or []
     except PackageNotFoundError as error:
-        raise StudyError(
-            f"the distribution {name!r} is not installed; install it, for example by pip install {name}"
-        ) from error
+        raise StudyError(f"the distribution {name!r} is not installed; install it, as by pip install {name}") from error
     for file in recorded:
         if file.as_posix() == path:
             return Path(str(file.locate()))
@@ -266,7 +260,7 @@ def matching_files(folder: Path, path: str) -> list[Path]:
     # A file may have wildcard characters in its name; an existing one is meant.
     if not has_magic(path) or os.path.isfile(folder / path):
         return [folder / path]
-    parts = Path(path).parts
+    parts, glob = Path(path).parts, quoted(path, 300)
     first = next(place for place, part in enumerate(parts) if has_magic(part))
     base, wild = folder.joinpath(*parts[:first]), parts[first:]
     try:
@@ -275,13 +269,11 @@ def matching_files(folder: Path, path: str) -> list[Path]:
         # At the end, ** stands for folders alone.
         found = [*base.glob("/".join([*wild, "*"] if wild[-1] == "**" else wild))]
     except ValueError as error:
-        raise StudyError(f"paths: the glob {quoted(path, 300)} is none: {error}") from error
+        raise StudyError(f"paths: the glob {glob} is none: {error}") from error
     if not any(part.startswith(".") for part in wild):
         found = [file for file in found if not any(part.startswith(".") for part in file.relative_to(base).parts)]
     if not (files := [file for file in dict.fromkeys(found) if file.is_file()]):
-        raise StudyError(
-            f"paths: the glob {quoted(path, 300)} matches no file below {base}; correct it, or put files there"
-        )
+        raise StudyError(f"paths: the glob {glob} matches no file below {base}; correct it, or put files there")
     return files
 
 

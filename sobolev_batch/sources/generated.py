@@ -100,10 +100,8 @@ class TorusSource(ClosedFormSource):
         finest = max(self.levels or (0,))
         triangles = 2 * self.around * self.across * 4**finest
         if triangles > MOST_TRIANGLES:
-            raise ValueError(
-                f"level {finest} of {self.around} x {self.across} cells has {triangles} triangles, at most "
-                f"{MOST_TRIANGLES} are allowed"
-            )
+            cells = f"level {finest} of {self.around} x {self.across} cells"
+            raise ValueError(f"{cells} has {triangles} triangles, at most {MOST_TRIANGLES} are allowed")
         return self
 
     def triangulation(self, level: int, identity: Fingerprint) -> Member:

@@ -233,7 +233,5 @@ def kind_of(surface: object, *of_points: Any) -> SurfaceKind:
     for surface_type, kind in _KINDS.items():
         if isinstance(surface, surface_type):
             return kind(surface.with_area if isinstance(surface, Mesh) else surface, *of_points)
-    raise InputError(
-        "a surface must be a Mesh, a Sphere or a parametrised surface (Ellipsoid, Torus, ParametrisedSurface), "
-        f"found {type(surface).__name__}"
-    )
+    expected = "a Mesh, a Sphere or a parametrised surface (Ellipsoid, Torus, ParametrisedSurface)"
+    raise InputError(f"a surface must be {expected}, found {type(surface).__name__}")

@@ -168,10 +168,8 @@ class Lattice(FrequencyLattice):
 
     def __post_init__(self) -> None:
         if not (is_finite_number(self.xi_max) and _LOWEST_XI_MAX <= self.xi_max <= 1 / _LOWEST_XI_MAX):
-            raise LatticeError(
-                f"xi_max must be a number from {_LOWEST_XI_MAX:g} to {1 / _LOWEST_XI_MAX:g}, found {self.xi_max!r}; "
-                "choose a unit of length in which it is"
-            )
+            ends = f"{_LOWEST_XI_MAX:g} to {1 / _LOWEST_XI_MAX:g}"
+            raise LatticeError(f"xi_max must be from {ends}, found {self.xi_max!r}; choose another unit of length")
         if not is_whole_number(self.M) or self.M % 2 or not 2 <= self.M <= LARGEST_M:
             raise LatticeError(f"M must be an even integer from 2 to {LARGEST_M}, found {self.M!r}")
         M = int(self.M)  # not NumPy's, whose products may overflow
@@ -232,10 +230,8 @@ class Lattice(FrequencyLattice):
         lattice = cls(float(axes[0][-1]), len(axes[0]) - 1)
         for name, axis, expected in zip(AXES, axes, lattice.axes, strict=True):
             if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=1e-12, atol=1e-12 * lattice.xi_max):
-                raise LatticeError(
-                    f"{name} does not run over the half (xi_z >= 0) of a lattice of xi_max {lattice.xi_max:g} and "
-                    f"M {lattice.M}; select whole fields, not parts of them"
-                )
+                half = f"the half (xi_z >= 0) of a lattice of xi_max {lattice.xi_max:g} and M {lattice.M}"
+                raise LatticeError(f"{name} does not run over {half}; select whole fields, not parts of them")
         return lattice
 
 

@@ -39,15 +39,12 @@ def resolution_of(surface: Smooth, highest_frequency: float, tolerance: float) -
     tolerance = min(max(tolerance, FINEST_CHANGE), COARSEST_CHANGE)
     (u, v), change = _refined(surface, highest_frequency, tolerance, MOST_NODES)
     if change > tolerance:
-        progress = "it would take more to begin with"
-        if math.isfinite(change):
-            progress = f"with {u} x {v} it still changes by {change:.2g} of the area"
+        still = f"with {u} x {v} it still changes by {change:.2g} of the area"
         raise InputError(
             f"the transform of the parametrised surface up to |xi| = {highest_frequency:.4g} is not settled to "
-            f"{tolerance:.2g} of its area with {MOST_NODES} nodes, the most that are tried ({MOST_GAUSS_NODES} along a "
-            f"parameter that is not periodic); {progress}. Its parametrisation is not smooth (a kink, a corner, an "
-            "unmarked period), or the surface is large or thin beside the shortest wavelength; lower xi_max, or allow "
-            "a larger eps"
+            f"{tolerance:.2g} of its area with {MOST_NODES} nodes, {MOST_GAUSS_NODES} along a parameter that is not "
+            f"periodic: {still if math.isfinite(change) else 'it would take more to begin with'}. It has a kink, a "
+            "corner or an unmarked period, or is large or thin beside the wavelength; lower xi_max, or raise eps"
         )
     return (u, v), change
 

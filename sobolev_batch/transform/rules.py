@@ -142,9 +142,7 @@ def fixed_rule(quadrature: str | int) -> TriangleRule | None:
         return None if quadrature == "auto" else gauss_rule(8)
     if isinstance(quadrature, int) and not isinstance(quadrature, bool) and 1 <= quadrature <= HIGHEST_DEGREE:
         return symmetric_rule(quadrature)
-    raise InputError(
-        f"quadrature must be 'auto', 'gauss8' or a degree from 1 to {HIGHEST_DEGREE}, found {quadrature!r}"
-    )
+    raise InputError(f"quadrature must be auto, gauss8 or a degree from 1 to {HIGHEST_DEGREE}, found {quadrature!r}")
 
 
 @lru_cache(maxsize=64)

@@ -44,7 +44,7 @@ TRIANGLES = [[0, 1, 2]]
         (np.array(VERTICES) * 1j, TRIANGLES, "vertices must be real numbers, found dtype complex128"),
         (np.array(VERTICES).astype(bool), TRIANGLES, "vertices must be real numbers"),
         ([[0, 0, 0], [1, 0], [0, 1, 0]], TRIANGLES, "vertices"),
-        (np.array(VERTICES) * 1e200, TRIANGLES, "largest absolute coordinate 4e+200; rescale it"),
+        (np.array(VERTICES) * 1e200, TRIANGLES, "overflow: largest absolute coordinate 4e+200; rescale it"),
         (VERTICES, [[0, 1, 2], [0, -1, 2]], "1 of 2 triangles have indices outside 0..2: #1 = [0, -1, 2]"),
         (VERTICES, np.array([[0, 1, 2**63]], dtype=np.uint64), "#0 = [0, 1, 9223372036854775808]"),
         (VERTICES, np.array([[0.0, 1.0, 2.0]]), "triangles must be integer indices, found dtype float64"),
@@ -55,7 +55,7 @@ TRIANGLES = [[0, 1, 2]]
         (
             [*VERTICES, [0.0, 0.0, 0.0], [1e200, 0.0, 0.0], [0.0, 1e-200, 0.0]],
             [[0, 1, 2], [3, 4, 5]],
-            "squared lengths overflow double precision: largest absolute coordinate 1e+200; rescale it",
+            "squared lengths overflow: largest absolute coordinate 1e+200; rescale it",
         ),
     ],
 )

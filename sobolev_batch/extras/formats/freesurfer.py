@@ -37,9 +37,7 @@ def is_freesurfer_name(name: str) -> bool:
 def parse_freesurfer(data: bytes) -> Raw:
     """Return the vertices and triangles of a FreeSurfer surface."""
     if len(data) >= 15 and len(data) == 15 + 4 * math.prod(np.frombuffer(data, ">i4", 3, 3)[[0, 2]].tolist()):
-        raise MeshError(
-            "it holds values at vertices, such as thickness or curvature; give the surface, such as lh.pial"
-        )
+        raise MeshError("it holds values at vertices, such as thickness; give the surface, such as lh.pial")
     if not data.startswith(_MAGIC):
         raise MeshError(
             f"it begins with the bytes {data[:3].hex(' ')} and is no FreeSurfer surface of triangles, which begins "
@@ -52,9 +50,7 @@ def parse_freesurfer(data: bytes) -> Raw:
     start = lines.end() + 8
     end = start + 12 * (vertices + triangles)
     if min(vertices, triangles) < 0 or end > len(data):
-        raise MeshError(
-            f"the header announces {vertices} vertices and {triangles} triangles, but the file has {len(data)} bytes"
-        )
+        raise MeshError(f"it announces {vertices} vertices and {triangles} triangles, but has {len(data)} bytes")
     if end < len(data) and not data[end : end + 12].startswith(_VOLUME):
         raise MeshError(f"the file has {len(data) - end} bytes behind its {triangles} triangles")
     coordinates = np.frombuffer(data, ">f4", 3 * vertices, start)

@@ -66,9 +66,7 @@ def parse_gifti(data: bytes) -> Raw:
             raise MeshError(f"the GIFTI header announces {announced[:20]} arrays, found {found}")
     points, faces = arrays.values()
     if len(points) != 1 or len(faces) != 1:
-        raise MeshError(
-            f"a GIFTI surface has one point set and one triangle array, found {len(points)} and {len(faces)}"
-        )
+        raise MeshError(f"a surface has one point set and one triangle array, found {len(points)} and {len(faces)}")
     return Raw(points[0], faces[0], notes)
 
 

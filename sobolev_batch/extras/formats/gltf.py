@@ -304,11 +304,8 @@ def _primitive(file: _File, primitive: dict[str, Any], weights: list[float]) -> 
         triangles = corners.reshape(-1, 3)
     else:
         raise MeshError(f"{len(corners)} indices make no whole triangles of the mode {mode}")
-    bad = np.count_nonzero((triangles >= len(vertices)).any(axis=1))
-    if bad:
-        raise MeshError(
-            f"{bad} of {len(triangles)} triangles of a primitive have indices outside 0..{len(vertices) - 1}"
-        )
+    if (triangles >= len(vertices)).any():
+        raise MeshError(f"a primitive has the index {triangles.max()}, outside 0..{len(vertices) - 1}")
     return vertices, triangles
 
 

@@ -66,9 +66,7 @@ class _Package:
         entry = self.archive.getinfo(self.names.get(name.lower(), name))
         self.left -= entry.file_size
         if self.left < 0 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise MeshError(
-                f"its part {name[:80]!r} unpacks to more than any mesh file does, or is packed in a rare way"
-            )
+            raise MeshError(f"its part {name[:80]!r} unpacks to more than mesh files do, or is packed in a rare way")
         require_memory_to_read(_MEMORY * (self.most - self.left))
         return self.archive.read(entry)
 
@@ -89,9 +87,8 @@ class _Package:
                     self.unread.add(word)
                 case "start", "model":
                     self.units.add(values.get("unit", _UNIT))
-                    names = [
-                        values.get(f"xmlns:{short}", short) for short in values.get("requiredextensions", "").split()
-                    ]
+                    required = values.get("requiredextensions", "").split()
+                    names = [values.get(f"xmlns:{short}", short) for short in required]
                     if wrong := [one for one in names if not any(word in one for word in _HARMLESS)]:
                         raise MeshError(f"it requires the 3MF extension {', '.join(wrong)}; export it without")
                 case "start", "object":
@@ -117,9 +114,7 @@ class _Package:
         # Any number of components may place one object.
         self.size += _OBJECT_BYTES + 8 * (len(found.vertices) + len(found.triangles))
         if depth > _DEEPEST or self.size > self.most:
-            raise MeshError(
-                f"it repeats objects until they are {_DEEPEST} deep or take {self.most} bytes; save it unfolded"
-            )
+            raise MeshError(f"it repeats objects, {_DEEPEST} deep or up to {self.most} bytes; save it unfolded")
         if found.kind in _SUPPORTS:
             self.supports += 1
             return
@@ -150,9 +145,7 @@ def parse_3mf(data: bytes) -> Raw:
     if others := len(_UNLIKE.findall(settings)):
         notes.append(f"{others} parts that the slicer calls modifiers, negative or for supports count like all others")
     if package.unread:
-        notes.append(
-            f"shapes of the kind {', '.join(sorted(package.unread))} are left out, which extensions of 3MF define"
-        )
+        notes.append(f"shapes of the kind {', '.join(sorted(package.unread))} are left out, as extensions of 3MF")
     if package.unprinted:
         notes.append(f"{package.unprinted} items that the slicer does not print count like all others")
     return Raw(*joined(parts), tuple(notes))

@@ -38,6 +38,7 @@ _START = re.compile(
 # Gmsh's numbers of cells: their corners, and which have an area or a volume.
 _CORNERS = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 6: 6, 7: 5, 15: 1}
 _WITH_AREA, _WITH_VOLUME = (2, 3), (4, 5, 6, 7)
+_SAVED = "gmsh scan.msh -save -format msh{} -o surface.msh"
 
 
 def parse_medit(data: bytes) -> Raw:
@@ -79,10 +80,7 @@ def parse_gmsh(data: bytes) -> Raw:
     """Return the vertices and triangles of a Gmsh mesh of the format 2.2 or 4.1."""
     head = _START.match(data)
     if head is None:
-        raise MeshError(
-            "it is no Gmsh mesh of the format 2.2 or 4.1; Gmsh converts its other formats: gmsh scan.msh -save -format "
-            "msh41 -o surface.msh"
-        )
+        raise MeshError(f"it is no Gmsh mesh of the format 2.2 or 4.1; Gmsh converts others: {_SAVED.format(41)}")
     order = "" if head[1].endswith(b"0") else "<" if head[2] == b"\1\0\0\0" else ">"
     nodes, cells = (_Numbers(data, name, order) for name in (b"Nodes", b"Elements"))
     read = _of_second_format if head[1].startswith(b"2") else _of_fourth_format
@@ -95,10 +93,7 @@ def parse_gmsh(data: bytes) -> Raw:
     repeated -= sum(map(len, kept))
     volumes = sum(len(corners) for kind, corners in rows if kind in _WITH_VOLUME)
     if volumes and b"$PartitionedEntities" in data:
-        raise MeshError(
-            "its volume is cut into partitions, and the faces between them are none of its surface; save it without: "
-            "gmsh scan.msh -save -format msh22 -o surface.msh"
-        )
+        raise MeshError(f"it has partitions, and the faces between them are inside; join them: {_SAVED.format(22)}")
     # Nodes have any numbers, in any order.
     order_of_nodes = np.argsort(numbered[:, 0])
     known = numbered[order_of_nodes, 0]
@@ -226,9 +221,7 @@ def _medit_rows(name: str, section: bytes, width: int) -> Reals:
     """Return the rows (n, width) of a section of a Medit mesh."""
     count, *values = _numbers(section, name) or [-1.0]
     if len(values) != count * width:
-        raise MeshError(
-            f"its section {name} announces {count:g} rows of {width} numbers, and has {len(values)} numbers"
-        )
+        raise MeshError(f"its section {name} announces {count:g} rows of {width} numbers, and has {len(values)}")
     return np.array(values).reshape(-1, width)
 
 

@@ -60,10 +60,7 @@ def parse_vtk(data: bytes, suffix: str) -> Raw:
     if kind.lower() not in _KINDS:
         raise MeshError(f"the file holds {kind[:40]}, no polygons; take its surface: {SURFACE.format(suffix)}")
     if any(piece.get("ghosts", _NONE).any() for piece in pieces):
-        raise MeshError(
-            "the file has ghost cells, which belong to other parts of a surface; remove them: in PyVista by "
-            "mesh.remove_ghost_cells()"
-        )
+        raise MeshError("it has ghost cells, which belong to other parts; remove them by PyVista's remove_ghost_cells")
     cells, points, before = [(_NONE, _NONE, _NONE)], [np.zeros((0, 3), np.float32)], 0
     for piece in pieces:
         coordinates = piece.get("points", points[0])
@@ -237,9 +234,7 @@ def _decoded(
         raise MeshError(f"{owner} has the type {kind[:40]!r} and the format {form[:40]!r}, which VTK does not have")
     order, head_kind = root.get("byte_order", "LittleEndian"), root.get("header_type", "UInt32").lower()
     if order not in BYTE_ORDERS or head_kind not in ("uint32", "uint64"):
-        raise MeshError(
-            f"it has the byte order {order[:40]!r} and counts in {head_kind[:40]!r}, which VTK does not have"
-        )
+        raise MeshError(f"it has the byte order {order[:40]!r} and counts in {head_kind[:40]!r}, unlike VTK's files")
     dtype = np.dtype(_TYPES[kind.lower()])
     if form == "ascii":
         return typed(text.split(), dtype, owner)
@@ -311,10 +306,8 @@ def _faces(kinds: Indices, corners: Indices, sizes: Indices, suffix: str) -> tup
     known = [kinds == _VTK_TRIANGLE, (kinds == _QUAD) | is_pixel, (kinds == _POLYGON) | is_strip]
     wrong = np.flatnonzero(has_area & (sizes != np.select(known, [3, 4, sizes], -1)))
     if wrong.size:
-        raise MeshError(
-            f"cell {wrong[0] + 1} is of VTK's type {kinds[wrong[0]]} with {sizes[wrong[0]]} corners, no flat polygon; "
-            f"take the surface: {SURFACE.format(suffix)}"
-        )
+        found = f"cell {wrong[0] + 1} is of VTK's type {kinds[wrong[0]]} with {sizes[wrong[0]]} corners"
+        raise MeshError(f"{found}, no flat polygon; take the surface: {SURFACE.format(suffix)}")
     # The corners of a pixel lie row by row, and not around it.
     last = (np.cumsum(sizes) - sizes)[is_pixel, None] + [2, 3]
     corners[last] = corners[last[:, ::-1]]

@@ -139,9 +139,7 @@ def _unpacked_bounded(packed: bytes, factor: float) -> bytes:
         while chunk := cast(IO[bytes], unpacked).read(_CHUNK_BYTES):
             data.write(chunk)
             if data.tell() > most:
-                raise MeshError(
-                    f"larger than {most} bytes once it is unpacked from {len(packed)}: no mesh file shrinks that far"
-                )
+                raise MeshError(f"{len(packed)} bytes unpack to more than {most}: no mesh file shrinks that far")
             if data.tell() > _HARMLESS_BYTES:
                 require_memory_to_read(factor * data.tell())
     return data.getvalue()

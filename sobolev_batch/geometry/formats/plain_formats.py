@@ -79,9 +79,7 @@ def parse_off(data: bytes) -> Raw:
     # The word may be missing, and the first count may follow it at once.
     word = re.fullmatch("((?:ST|C|N)*OFF)?([0-9]*)", first[0].upper())
     if word is None or not word[0]:
-        raise MeshError(
-            f"the file does not begin with OFF, NOFF or such, nor with its counts, but with {first[0][:40]!r}"
-        )
+        raise MeshError(f"the file does not begin with OFF or such, nor with its counts, but with {first[0][:40]!r}")
     kind, counts = word[1] or "OFF", [*filter(None, word.groups()[1:]), *first[1:]]
     has_colors = "C" in kind
     least = 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
@@ -126,10 +124,8 @@ def _parsed_off(
         sizes.append(size)
         colored += len(words) > 1 + size
     if words := next(rows, []):
-        raise MeshError(
-            f"the OFF header announces {vertex_count} vertices and {face_count} faces, but more follows: "
-            f"{' '.join(words)[:80]!r}"
-        )
+        counted = f"{vertex_count} vertices and {face_count} faces"
+        raise MeshError(f"the OFF header announces {counted}, but more follows: {' '.join(words)[:80]!r}")
     raw = cut_polygons(np.array(vertices).reshape(-1, 3), np.array(corners), np.array(sizes))
     note = f"{colored:,} of {face_count:,} faces have numbers behind their corners, which are taken for colours"
     return raw._replace(notes=(*raw.notes, note)) if 0 < colored < face_count else raw
@@ -207,9 +203,7 @@ def parse_stl(data: bytes) -> Raw:
             corners = _stl_text_corners(_STL_STATEMENT.sub(b"\n", _STL_BLANK.sub(b"", data)))
     else:
         count = max(0, len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize
-        raise MeshError(
-            f"a binary STL file of {len(data)} bytes holds {count:.2f} triangles, but its header announces {announced}"
-        )
+        raise MeshError(f"a file of {len(data)} bytes holds {count:.2f} triangles, but announces {announced}")
     if not len(corners):
         raise MeshError("the file has no faces")
     return Raw(*merge_coincident(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3)))

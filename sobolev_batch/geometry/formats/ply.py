@@ -212,10 +212,8 @@ def _require_aligned(lines: NDArray[np.uintc], rows: Sequence[Indices]) -> None:
     wrong = np.flatnonzero(~is_whole & (ends <= lines_end[-1:]))
     is_by_row = len(lines) > MOST_LINES * len(ends) and 2 * np.count_nonzero(is_whole) > len(ends)
     if wrong.size and (len(lines) == len(ends) or is_by_row):
-        raise MeshError(
-            f"row {wrong[0] + 1} below the PLY header does not end with its line, as others do: "
-            "a line has a number too many or too few"
-        )
+        row = f"row {wrong[0] + 1} below the PLY header"
+        raise MeshError(f"{row} does not end with its line: a line has a number too many or too few")
 
 
 def _columns(element: _Element, wanted: Sequence[str], body: memoryview, start: int) -> tuple[_Values, _Sizes, int]:
@@ -263,9 +261,8 @@ def _walked(
                 values += body[place : place + width]
             place += width
         if place > len(body):
-            raise MeshError(
-                f"the file breaks off in {element.name} {number + 1} of {count}; it is cut, or has wrong counts before"
-            )
+            entry = f"{element.name} {number + 1} of {count}"
+            raise MeshError(f"the file breaks off in {entry}; it is cut, or has wrong counts before")
     found = dict(zip(element.properties, steps, strict=True))
     of_lists = {name: np.array(sizes, np.int64) for name, (head, _, sizes, *_) in found.items() if head}
     return {name: np.frombuffer(found[name][3], element.properties[name].stored) for name in wanted}, of_lists, place

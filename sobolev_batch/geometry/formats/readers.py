@@ -104,9 +104,7 @@ def _files_beside(path: Path, names: Iterable[str]) -> dict[str, Path]:
         # Links are followed here, so that none leads elsewhere.
         found[name] = (folder / name).resolve()
         if not found[name].is_relative_to(folder) or ":" in name or not found[name].is_file():
-            raise MeshError(
-                f"it needs {name[:80]!r}, which is no file in its folder; put it there, or export both as one file"
-            )
+            raise MeshError(f"it needs {name[:80]!r}, which is no file in its folder; put it there, or export one file")
     return found
 
 
