@@ -13,15 +13,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Interval, Smooth
 from sobolev_batch.geometry.subdivision import icosphere
-from sobolev_batch.geometry.surface import (
-    DIRECTIONS,
-    LARGEST_LENGTH,
-    Extent,
-    Point,
-    checked_point,
-    is_finite_number,
-    moved_point,
-)
+from sobolev_batch.geometry.surface import DIRECTIONS, LARGEST_LENGTH, Extent, Point, checked_point, is_finite_number
 from sobolev_batch.parameters import is_whole_number
 
 _ANGLE = Interval(0.0, 2 * math.pi, periodic=True)
@@ -72,7 +64,7 @@ class Sphere:
 
     def moved(self, scale: float, origin: Point) -> Self:
         """Return the sphere after x -> scale * (x - origin)."""
-        return type(self)(scale * self.radius, moved_point(self.center, scale, origin))
+        return type(self)(scale * self.radius, _moved(self.center, scale, origin))
 
 
 @dataclass(frozen=True)
@@ -126,7 +118,7 @@ class Ellipsoid(Smooth):
     def moved(self, scale: float, origin: Point) -> Self:
         """Return the ellipsoid after x -> scale * (x - origin)."""
         a, b, c = self.axes
-        return type(self)((scale * a, scale * b, scale * c), moved_point(self.center, scale, origin))
+        return type(self)((scale * a, scale * b, scale * c), _moved(self.center, scale, origin))
 
     @cached_property
     def area(self) -> float:
@@ -203,7 +195,7 @@ class Torus(Smooth):
 
     def moved(self, scale: float, origin: Point) -> Self:
         """Return the torus after x -> scale * (x - origin)."""
-        return type(self)(scale * self.R, scale * self.r, moved_point(self.center, scale, origin))
+        return type(self)(scale * self.R, scale * self.r, _moved(self.center, scale, origin))
 
     @cached_property
     def area(self) -> float:
@@ -245,3 +237,8 @@ class Torus(Smooth):
         ahead, above = np.roll(corner, -1, axis=0), np.roll(corner, -1, axis=1)
         opposite = np.roll(ahead, -1, axis=1)
         return Mesh(vertices, np.stack([corner, ahead, opposite, corner, opposite, above], axis=-1).reshape(-1, 3))
+
+
+def _moved(point: Point, scale: float, origin: Point) -> Point:
+    x, y, z = (scale * (coordinate - shift) for coordinate, shift in zip(point, origin, strict=True))
+    return x, y, z

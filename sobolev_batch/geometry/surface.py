@@ -218,12 +218,6 @@ def checked_point(point: Sequence[float], label: str) -> Point:
     return x, y, z
 
 
-def moved_point(point: Point, scale: float, origin: Point) -> Point:
-    """Return scale * (point - origin)."""
-    x, y, z = (scale * (coordinate - shift) for coordinate, shift in zip(point, origin, strict=True))
-    return x, y, z
-
-
 def normals(vertices: Reals, triangles: NDArray[np.integer]) -> Reals:
     """Return the normals of triangles (m, 3), each as long as twice its area."""
     a, b, c = (vertices[corner] for corner in triangles.T)
