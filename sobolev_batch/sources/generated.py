@@ -1,21 +1,20 @@
 """Families from formulas: closed forms and their triangulations; docs/studies.md has their keys."""
 
-from collections.abc import Callable
 from dataclasses import astuple, fields
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from sobolev_batch.errors import refused_by_pydantic
 from sobolev_batch.geometry.closed_forms import MOST_TRIANGLES, Ellipsoid, Sphere, Torus
-from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.subdivision import FINEST_LEVEL, icosphere
 from sobolev_batch.sources.registry import Fingerprint, MadeMember, Member, Several, Source, SurfaceMember
 
-# Measured peak of the subdivision, for each triangle that it makes.
-_SUBDIVISION_BYTES = 140
+# A level of known size; 140 is the measured peak of the subdivision, for each triangle that it makes.
+_triangulation = partial(MadeMember, triangle_bytes=140)
 
 ClosedForm = Sphere | Ellipsoid | Torus
 
@@ -77,7 +76,7 @@ class EllipsoidSource(ClosedFormSource):
     def triangulation(self, level: int, identity: Fingerprint) -> Member:
         """Return the icosphere of a level, moved onto the ellipsoid."""
         own = {"ellipsoid level": level, **identity}
-        return _triangulation(level, Ellipsoid.mesh, (self.shape, level), own, 20 << 2 * level)
+        return _triangulation(str(level), level, Ellipsoid.mesh, own, (self.shape, level), triangles=20 << 2 * level)
 
 
 class TorusSource(ClosedFormSource):
@@ -107,8 +106,8 @@ class TorusSource(ClosedFormSource):
     def triangulation(self, level: int, identity: Fingerprint) -> Member:
         """Return the grid of a level."""
         around, across = self.around << level, self.across << level
-        own = {"torus grid": [around, across], **identity}
-        return _triangulation(level, Torus.mesh, (self.shape, around, across), own, 2 * around * across)
+        own, triangles = {"torus grid": [around, across], **identity}, 2 * around * across
+        return _triangulation(str(level), level, Torus.mesh, own, (self.shape, around, across), triangles=triangles)
 
 
 class IcosphereSource(Source):
@@ -119,13 +118,6 @@ class IcosphereSource(Source):
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per level, coarse to fine."""
         levels = sorted(set(self.levels))
-        return tuple(_triangulation(n, icosphere, (n,), {"icosphere": n}, 20 << 2 * n) for n in levels)
-
-
-def _triangulation(
-    level: int, make: Callable[..., Mesh], arguments: tuple[Any, ...], identity: Fingerprint, triangles: int
-) -> Member:
-    """Return the member of a level, whose number of triangles is known before it is made."""
-    return MadeMember(
-        str(level), level, make, identity, arguments, triangles=triangles, triangle_bytes=_SUBDIVISION_BYTES
-    )
+        return tuple(
+            _triangulation(str(n), n, icosphere, {"icosphere": n}, (n,), triangles=20 << 2 * n) for n in levels
+        )
