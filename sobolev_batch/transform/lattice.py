@@ -86,9 +86,7 @@ class Block:
             if math.prod(shape) <= largest_size:
                 break
         tiles = self.tiles((shape[0], shape[1], shape[2]))
-        return tuple(
-            Block(tile.start, (x.stop - x.start, y.stop - y.start, z.stop - z.start)) for tile, (x, y, z) in tiles
-        )
+        return tuple(part for tile, _ in tiles if (part := self.intersection(tile)))
 
     def tiles(self, shape: tuple[int, int, int]) -> Iterator[tuple[Block, tuple[slice, slice, slice]]]:
         """Yield blocks of one shape that cover this one or more, each with its slices of an array of this one."""
