@@ -241,14 +241,10 @@ def probe_block(
     if not needs_probe(surface, settings):
         return Probe()
     count = (_OWN if sample is None else _OWN_BESIDE_SAMPLE) * draws.count
-    pooled, common = with_own(draws, count, lattice, block, values), draws.inside(block)
-    if sample is None:
-        exact = Sample.from_surface(surface, pooled, execution).exact
-    else:
-        further = pooled.frequencies[np.count_nonzero(common) :]
-        own = kind_of(surface).exact_values(further, execution.threads, execution.backend)
-        exact = np.concatenate([sample.exact[common], own])
-    probe = measure(pooled, values[tuple((pooled.indices - block.start).T)], exact)
+    pooled = with_own(draws, count, lattice, block, values)
+    known = np.zeros(0, np.complex128) if sample is None else sample.exact[draws.inside(block)]
+    own = kind_of(surface).exact_values(pooled.frequencies[len(known) :], execution.threads, execution.backend)
+    probe = measure(pooled, values[tuple((pooled.indices - block.start).T)], np.concatenate([known, own]))
     change = settings.kind_for(surface, lattice).change
     if change and block.start == lattice.half.start:
         return join([probe, uniform_probe(lattice, change * surface.area)])
