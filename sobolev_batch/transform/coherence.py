@@ -31,13 +31,13 @@ _MIXERS = np.array([43758.5453, 12989.8, 7823.3])
 _MULTIPLES = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 1.5])
 
 
-def unpaired(mesh: Mesh, faces: FaceArrays | None = None) -> float:
+def unpaired(faces: FaceArrays) -> float:
     """Return the fraction of odd errors that adds up: 0 where each triangle has an opposite one, 1 where all are alike.
 
     The leading odd error is that of third moments about the centroid: of products of the three corners.
     """
     total, amount = np.zeros(len(_MULTIPLES)), 0.0
-    for batch in (faces or FaceArrays.of_mesh(mesh)).batches(_BATCH):
+    for batch in faces.batches(_BATCH):
         moments, norms = _third_moments(batch)
         total += moments
         amount += norms

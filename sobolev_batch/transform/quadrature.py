@@ -90,7 +90,8 @@ def assign_rules(
     """
     if (fixed := fixed_rule(quadrature)) is not None:
         return (RuleUse(fixed, 0, np.arange(len(mesh.triangles), dtype=np.uint32)),)
-    tolerance = tolerance_for(mesh, highest_frequency, eps, faces, backend) if tolerance is None else tolerance
+    if tolerance is None:
+        tolerance = tolerance_for(mesh, highest_frequency, eps, faces or FaceArrays.of_mesh(mesh), backend)
     rules, ranges = rule_ranges(tolerance, shares_vertices(mesh))
     sizes = mesh.centroid_radii
     keys = np.empty(len(sizes), dtype=np.uint16)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.transform.backends import CPU, Backend, sums_at
+from sobolev_batch.transform.backends import Backend, sums_at
 from sobolev_batch.transform.coherence import RANGES, coherence, unpaired
 from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.lattice import FrequencyLattice
@@ -32,7 +32,7 @@ def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[fl
 
     On fine meshes the prediction was measured to be one to ten times the true error, on coarse ones down to a fifth.
     """
-    classes, shared, radii = size_classes(mesh), shares_vertices(mesh), _radii(lattice)
+    classes, shared, radii = size_classes(mesh, FaceArrays.of_mesh(mesh)), shares_vertices(mesh), _radii(lattice)
     mean = _mean_coherence(radii, classes)
 
     def suffices(tolerance: float) -> bool:
@@ -42,9 +42,7 @@ def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[fl
     return _loosest(FINEST_TOLERANCE, suffices)
 
 
-def tolerance_for(
-    mesh: Mesh, highest_frequency: float, eps: float, faces: FaceArrays | None = None, backend: Backend = CPU
-) -> float:
+def tolerance_for(mesh: Mesh, highest_frequency: float, eps: float, faces: FaceArrays, backend: Backend) -> float:
     """Return the largest tolerance of triangle rules with a predicted error of eps · area at most up to a frequency.
 
     It is eps at least. The errors of triangles that are small beside the wavelength cancel, unless pieces of the mesh
@@ -52,7 +50,7 @@ def tolerance_for(
     boxes, tetrahedra and spheres 0.6, and of two layers of opposite triangles 1.5.
     """
     classes, shared = size_classes(mesh, faces), shares_vertices(mesh)
-    radii, alike = highest_frequency * (np.arange(RANGES) + 1) / RANGES, unpaired(mesh, faces) ** 2
+    radii, alike = highest_frequency * (np.arange(RANGES) + 1) / RANGES, unpaired(faces) ** 2
     allowed = (_TYPICAL_OF_LARGEST * eps * float(classes[2].sum())) ** 2
     mean, none, whole = _mean_coherence(radii, classes), np.zeros(RANGES), np.ones(RANGES)
 
@@ -78,7 +76,7 @@ def _loosest(finest: float, suffices: Callable[[float], bool]) -> float:
     return float(tolerances[bisect_left(tolerances[:-1], True, key=suffices)])
 
 
-def size_classes(mesh: Mesh, faces: FaceArrays | None = None) -> Reals:
+def size_classes(mesh: Mesh, faces: FaceArrays) -> Reals:
     """Return the triangles of a mesh in classes of similar size, (4, classes).
 
     The rows are the least and greatest centroid radius of each class, and its sums of areas and of squared areas.
@@ -87,11 +85,9 @@ def size_classes(mesh: Mesh, faces: FaceArrays | None = None) -> Reals:
     smallest = max(float(mesh.centroid_radii.min()), 1e-6 * largest)
     count = max(1, min(_BINS, math.ceil(8 * math.log(largest / smallest))))
     edges = np.geomspace(smallest, largest, count + 1)
-    radii, areas, backend = mesh.centroid_radii, mesh.areas, CPU
-    if faces is not None:
-        radii, areas, backend = faces.radii, faces.areas, faces.backend
-    classes = np.searchsorted(np.asarray(edges[1:-1], like=radii), radii)
-    sums = (backend.download(sums_at(classes, values, count)) for values in (areas, areas * areas))
+    classes = np.searchsorted(np.asarray(edges[1:-1], like=faces.radii), faces.radii)
+    values = faces.areas, faces.areas * faces.areas
+    sums = (faces.backend.download(sums_at(classes, each, count)) for each in values)
     return np.stack([edges[:-1], edges[1:], *sums])
 
 
