@@ -176,13 +176,11 @@ def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
     """Return the JSON of a file and the second chunk of a binary one."""
     binary = None
     if data[:4] == b"glTF":
-        version, length = struct.unpack_from("<II", data, 4)
+        version, length, size = struct.unpack_from("<III", data, 4)
         _require_second(str(version))
         if length != len(data):
             raise MeshError(f"a GLB file announces {length} bytes, found {len(data)}")
-        size = struct.unpack_from("<I", data, 12)[0]
-        rest = data[20 + size :]
-        if rest:
+        if rest := data[20 + size :]:
             binary_size = struct.unpack_from("<I", rest, 0)[0]
             binary = rest[8 : 8 + binary_size]
             if len(binary) != binary_size:
@@ -207,8 +205,7 @@ def _node_matrices(tree: dict[str, Any]) -> dict[int, Reals]:
     nodes = tree.get("nodes", [])
     if len(nodes) > _MOST_NODES:
         raise MeshError(f"it has {len(nodes)} nodes, of which {_MOST_NODES} are read; export it with fewer")
-    scenes = tree.get("scenes")
-    if scenes:
+    if tree.get("scenes"):
         roots = _entry(tree, "scenes", tree.get("scene", 0)).get("nodes", [])
     else:
         children = {child for node in nodes for child in node.get("children", [])}
