@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Sequence
-from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.extras.formats.shared import SURFACE, beside_volume
 from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import Raw, reals, whole
+from sobolev_batch.geometry.formats.plain_formats import text_rows
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.mesh import Mesh
 
@@ -67,13 +67,9 @@ def parse_medit(data: bytes) -> Raw:
 
 def write_medit(mesh: Mesh) -> bytes:
     """Return a Medit mesh in text, all digits kept."""
-    file = BytesIO()
-    file.write(f"MeshVersionFormatted 2\nDimension 3\nVertices {len(mesh.vertices)}\n".encode())
-    np.savetxt(file, mesh.vertices, fmt="%.17g %.17g %.17g 0")
-    file.write(f"Triangles {len(mesh.triangles)}\n".encode())
-    np.savetxt(file, mesh.triangles + 1, fmt="%d %d %d 0")
-    file.write(b"End\n")
-    return file.getvalue()
+    vertices, triangles = text_rows("%.17g %.17g %.17g 0", mesh.vertices), text_rows("%d %d %d 0", mesh.triangles + 1)
+    head = b"MeshVersionFormatted 2\nDimension 3\nVertices %d\n" % len(mesh.vertices)
+    return head + vertices + b"Triangles %d\n" % len(mesh.triangles) + triangles + b"End\n"
 
 
 def parse_gmsh(data: bytes) -> Raw:

@@ -8,8 +8,10 @@ import re
 from array import array
 from collections.abc import Iterator
 from itertools import chain, islice
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
@@ -36,8 +38,6 @@ _COUNT = re.compile("[0-9]{1,18}")
 _COMMENT = re.compile(r"(?<!\S)#")
 # Characters of a line: a polygon of a hundred thousand corners.
 _LONGEST_LINE = 1 << 20
-# Seventeen digits give every double back.
-_DIGITS = "%.17g"
 _STL_HEADER_BYTES = 84
 # A text has no zero byte; a binary file of fewer than 16 million triangles has one within this many.
 _STL_START_BYTES = 1024
@@ -209,21 +209,22 @@ def parse_stl(data: bytes) -> Raw:
     return Raw(*merge_coincident(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3)))
 
 
+def text_rows(form: str, rows: NDArray[Any]) -> bytes:
+    """Return rows of numbers as lines of a form; seventeen digits give every double back."""
+    file = io.BytesIO()
+    np.savetxt(file, rows, fmt=form)
+    return file.getvalue()
+
+
 def write_obj(mesh: Mesh) -> bytes:
     """Return an OBJ file, all digits kept."""
-    file = io.BytesIO()
-    np.savetxt(file, mesh.vertices, fmt=f"v {_DIGITS} {_DIGITS} {_DIGITS}")
-    np.savetxt(file, mesh.triangles + 1, fmt="f %d %d %d")
-    return file.getvalue()
+    return text_rows("v %.17g %.17g %.17g", mesh.vertices) + text_rows("f %d %d %d", mesh.triangles + 1)
 
 
 def write_off(mesh: Mesh) -> bytes:
     """Return an OFF file, all digits kept."""
-    file = io.BytesIO()
-    file.write(f"OFF\n{len(mesh.vertices)} {len(mesh.triangles)} 0\n".encode())
-    np.savetxt(file, mesh.vertices, fmt=_DIGITS)
-    np.savetxt(file, mesh.triangles, fmt="3 %d %d %d")
-    return file.getvalue()
+    head = b"OFF\n%d %d 0\n" % (len(mesh.vertices), len(mesh.triangles))
+    return head + text_rows("%.17g", mesh.vertices) + text_rows("3 %d %d %d", mesh.triangles)
 
 
 def write_stl(mesh: Mesh) -> bytes:
@@ -234,8 +235,7 @@ def write_stl(mesh: Mesh) -> bytes:
     records["corners"] = mesh.vertices[mesh.triangles]
     # That of a triangle without an area is zero.
     records["normal"] = np.divide(across, lengths, where=lengths > 0, out=np.zeros_like(across))
-    header = bytes(_STL_HEADER_BYTES - 4) + len(across).to_bytes(4, "little")
-    return header + records.tobytes()
+    return bytes(_STL_HEADER_BYTES - 4) + len(across).to_bytes(4, "little") + records.tobytes()
 
 
 def _text_lines(data: bytes) -> Iterator[str]:
