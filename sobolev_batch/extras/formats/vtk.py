@@ -9,6 +9,7 @@ import re
 import zlib
 from collections.abc import Mapping
 from functools import partial
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -65,9 +66,8 @@ def parse_vtk(data: bytes, suffix: str) -> Raw:
     for piece in pieces:
         coordinates = piece.get("points", points[0])
         for name, cell_type in zip(_FACES, (_POLYGON, _STRIP, None), strict=True):
-            corners, offsets = (
-                piece.get(f"{name} {one}", _NONE).astype(np.int64) for one in ("connectivity", "offsets")
-            )
+            corners = piece.get(f"{name} connectivity", _NONE).astype(np.int64)
+            offsets = piece.get(f"{name} offsets", _NONE).astype(np.int64)
             sizes = np.diff(offsets, prepend=0)
             if (sizes < 0).any() or sizes.sum() != len(corners):
                 raise MeshError(f"the offsets of its {name} do not run from 0 up to their {len(corners)} corners")
@@ -166,9 +166,8 @@ def _of_legacy(data: bytes) -> tuple[str, list[_Arrays]]:
                 last = data.find(b"POINT_DATA ", file.place)
                 if ghosts := _GHOSTS.search(data, file.place, len(data) if last < 0 else last):
                     file.place = ghosts.end()
-                    found["ghosts"] = file.array(
-                        whole(count, name), "double" if ghosts[1] and file.is_text else "unsigned_char"
-                    )
+                    number = "double" if ghosts[1] and file.is_text else "unsigned_char"
+                    found["ghosts"] = file.array(whole(count, name), number)
                 break
             case ["point_data", _]:
                 file.place = max(data.find(b"CELL_DATA ", file.place), 0) or len(data)
@@ -261,12 +260,11 @@ def _decoded(
         sizes = [*[size] * (count - 1), last or size][:count]
         if sum(sizes) > most:
             raise MeshError(f"its arrays unpack to more than {most} bytes: no mesh file shrinks that far")
-        (blocks, end), ends = fetch(after, sum(lengths)), np.cumsum([0, *lengths]).tolist()
+        blocks, end = fetch(after, sum(lengths))
+        stream = BytesIO(blocks)
         # One byte more shows whether there are more.
-        parts = [
-            _unpacked(blocks[begin:stop], expected + 1, packed)
-            for begin, stop, expected in zip(ends[:-1], ends[1:], sizes, strict=True)
-        ]
+        pairs = zip(lengths, sizes, strict=True)
+        parts = [_unpacked(stream.read(length), expected + 1, packed) for length, expected in pairs]
         if [*map(len, parts)] != sizes:
             raise MeshError(f"{owner} unpacks to other sizes than announced")
         data = b"".join(parts)
