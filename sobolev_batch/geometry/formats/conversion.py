@@ -28,10 +28,7 @@ T = TypeVar("T")
 # A further kind has a class in `transform/kinds` too.
 SURFACE_KINDS = (Mesh, Sphere, Smooth)
 
-_EXPECTED = (
-    "a Mesh, the path of a mesh file, a pair (vertices, triangles) of arrays, or a mesh of trimesh, PyVista, meshio or "
-    "Open3D"
-)
+_EXPECTED = "a Mesh, the path of a mesh file, a pair (vertices, triangles), one of trimesh, PyVista, meshio or Open3D"
 _SMOOTH = "a parametrised surface (Ellipsoid, Torus, ParametrisedSurface)"
 # Cells of meshio with flat faces, and those without area.
 _FACES, _WITHOUT_AREA = ("triangle", "quad", "polygon"), ("vertex", "line", "line3")
@@ -76,9 +73,8 @@ def as_surface(surface: SurfaceLike, *, or_field: bool = False) -> Surface:
     """Return a surface in closed form as it is, and anything else as a mesh, or InputError; see `as_mesh`."""
     if isinstance(surface, SURFACE_KINDS):
         return surface
-    return _converted(
-        surface, f"{_EXPECTED}, a Sphere{f', {_SMOOTH} or a Fourier field' if or_field else f' or {_SMOOTH}'}"
-    )
+    others = f"a Sphere, {_SMOOTH} or a Fourier field" if or_field else f"a Sphere or {_SMOOTH}"
+    return _converted(surface, f"{_EXPECTED}, {others}")
 
 
 def each(convert: Callable[[Any], T], given: Mapping[str, Any]) -> list[T]:
