@@ -260,11 +260,9 @@ class Mesh:
         ('3 open edges', 'Euler characteristic 1 (was 2)')
         """
         new = [text for kind, text in self._defects.items() if kind not in original._defects]
-        counts, were = ((one.merged or one).counts for one in (self, original))
+        now, was = ((one.merged or one).counts for one in (self, original))
         named = {"components": "components", "euler_characteristic": "Euler characteristic"}
-        changes = [
-            f"{name} {counts[key]:,} (was {were[key]:,})" for key, name in named.items() if counts[key] != were[key]
-        ]
+        changes = [f"{name} {now[key]:,} (was {was[key]:,})" for key, name in named.items() if now[key] != was[key]]
         return (*new, *changes)
 
     @cached_property
@@ -282,11 +280,8 @@ class Mesh:
             return self.merged.volume if self.merged else np.nan
         # From a point nearby: far from the origin, the parts cancel.
         origin = self.vertices[self.triangles[0, 0]]
-        parts = []
-        for batch in slices(len(self.triangles), _BATCH):
-            a, b, c = (corner - origin for corner in self.corners(batch))
-            parts.append(float(np.einsum("ij,ij->", a, np.cross(b, c))))
-        return math.fsum(parts) / 6
+        batches = ([corner - origin for corner in self.corners(batch)] for batch in slices(len(self.triangles), _BATCH))
+        return math.fsum(float(np.einsum("ij,ij->", a, np.cross(b, c))) for a, b, c in batches) / 6
 
     @property
     def smallest_angles(self) -> Reals:
