@@ -69,9 +69,8 @@ class Extent:
         """Return the extent of points (3, n), n > 0."""
         # Products with -1, 0 and 1 have no rounding.
         batches = (_NEIGHBOURS @ coordinates[:, part] for part in slices(coordinates.shape[1], _BATCH))
-        ends = [(along.min(axis=1), along.max(axis=1)) for along in batches]
-        lowest, highest = np.min([low for low, _ in ends], axis=0), np.max([high for _, high in ends], axis=0)
-        return cls(tuple((lowest / _LENGTHS).tolist()), tuple((highest / _LENGTHS).tolist()))
+        ends = ((along.min(axis=1) / _LENGTHS, along.max(axis=1) / _LENGTHS) for along in batches)
+        return cls.union([cls(tuple(low.tolist()), tuple(high.tolist())) for low, high in ends])
 
     @property
     def widths(self) -> Reals:
