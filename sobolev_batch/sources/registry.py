@@ -35,20 +35,19 @@ _EXAMPLE = '{ source = "files", paths = ["a.ply"] }'
 # How to give a mesh that is missing.
 MESH_HINT = f"give one, such as mesh = {_EXAMPLE}"
 
-_HERE = "sobolev_batch.sources"
 # The sources of this folder, by name.
 _OWN = {
-    "command": f"{_HERE}.command:CommandSource",
-    "decimate": f"{_HERE}.derived:DecimateSource",
-    "ellipsoid": f"{_HERE}.generated:EllipsoidSource",
-    "files": f"{_HERE}.files:FileSource",
-    "flow": f"{_HERE}.derived:FlowSource",
-    "function": f"{_HERE}.command:FunctionSource",
-    "icosphere": f"{_HERE}.generated:IcosphereSource",
-    "remesh": f"{_HERE}.derived:RemeshSource",
-    "sphere": f"{_HERE}.generated:SphereSource",
-    "spherical-levels": f"{_HERE}.derived:SphericalLevelsSource",
-    "torus": f"{_HERE}.generated:TorusSource",
+    "command": "command:CommandSource",
+    "decimate": "derived:DecimateSource",
+    "ellipsoid": "generated:EllipsoidSource",
+    "files": "files:FileSource",
+    "flow": "derived:FlowSource",
+    "function": "command:FunctionSource",
+    "icosphere": "generated:IcosphereSource",
+    "remesh": "derived:RemeshSource",
+    "sphere": "generated:SphereSource",
+    "spherical-levels": "derived:SphericalLevelsSource",
+    "torus": "generated:TorusSource",
 }
 
 Fingerprint = Mapping[str, Any]
@@ -445,6 +444,6 @@ def installed_version(distribution: str) -> str:
 @lru_cache(maxsize=1)
 def sources_by_name() -> dict[str, EntryPoint]:
     """Return where each source is loaded from, those of other packages among them."""
-    own = [EntryPoint(name, value, SOURCES) for name, value in _OWN.items()]
+    own = [EntryPoint(name, f"{__package__}.{value}", SOURCES) for name, value in _OWN.items()]
     # The first one that has a name keeps it.
     return {point.name: point for point in reversed((*own, *registered(SOURCES)))}
