@@ -232,10 +232,7 @@ class RemeshedMember(Member):
     files: Mapping[str, Path]
     cache: MeshCache
 
-    @property
-    def names_wishes(self) -> bool:
-        """True: a remesher makes about as many triangles as it was asked for."""
-        return True
+    names_wishes = True  # a remesher makes about as many triangles as it was asked for
 
     def load(self) -> Mesh:
         """Return the mesh that is kept, or make it and keep it; MeshError where that failed, or is not permitted."""
