@@ -54,10 +54,8 @@ def _problems(source: Source, folder: Path) -> Iterator[str]:
     if not names or names != names_again:
         yield f"members() lists {quoted(names)} first and {quoted(names_again)} next; list the same each time"
     for group in duplicate_names(member.name for member in members):
-        yield (
-            f"members() returns the names {', '.join(map(quoted, group[:5]))}, which are the same but for case and "
-            "accents; make them unique"
-        )
+        alike = ", ".join(map(quoted, group[:5]))
+        yield f"members() returns the names {alike}, which are the same but for case and accents; make them unique"
     first_of: dict[str, tuple[str, object]] = {}
     for member, twin in zip(members, again, strict=False):
         label, digest = f"the member {quoted(member.name)}", member.fingerprint_digest()
