@@ -51,6 +51,8 @@ MeshTable = dict[str, Any]
 # Columns of names, which may look like numbers.
 _TEXTS = ("path", "name", "object", "method")
 _EXAMPLE = '{ path = "a.ply", method_seconds = 3.5 }'
+_Text = Annotated[str, Field(min_length=1)]
+_Paths = Annotated[tuple[_Text, ...], Field(min_length=1, strict=False), at_most(MOST_MESHES)]
 
 
 def checked_list(value: object) -> str | tuple[MeshTable, ...] | None:
@@ -164,14 +166,9 @@ class FileSource(Source):
     mesh that moves: one for each file, in the order of the numbers in their names, or "names" for the last of these.
     """
 
-    paths: (
-        Annotated[
-            tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False), at_most(MOST_MESHES)
-        ]
-        | None
-    ) = None
+    paths: _Paths | None = None
     meshes: Annotated[str | tuple[MeshTable, ...] | None, BeforeValidator(checked_list)] = None
-    distribution: Annotated[str, Field(min_length=1)] | None = None
+    distribution: _Text | None = None
     times: Annotated[tuple[float, ...] | Literal["names"] | None, BeforeValidator(_checked_times)] = None
 
     @model_validator(mode="after")
@@ -317,9 +314,8 @@ def file_digest(path: Path) -> str:
     try:
         with open_regular(path) as file:
             checked_length(file)
-            state = _settled_state(path, file)
-            known = _digests.get(state)
-            return known or _remembered(state, hashlib.file_digest(file, "sha256").hexdigest())
+            state = _settled_state(file)
+            return _digests.get(state) or _remembered(state, hashlib.file_digest(file, "sha256").hexdigest())
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
     except (OSError, ValueError) as error:
@@ -327,17 +323,17 @@ def file_digest(path: Path) -> str:
 
 
 def _read_once(file: BufferedReader, length: int) -> bytes:
-    state, data = _settled_state(Path(file.name), file), file.read(length)
+    state, data = _settled_state(file), file.read(length)
     _remembered(state, hashlib.sha256(data).hexdigest())
     return data
 
 
-def _settled_state(path: Path, file: BufferedReader) -> _State:
+def _settled_state(file: BufferedReader) -> _State:
     """Return what the file system says of an open file; nothing where a change of the file might not show in it."""
     now, status = time.time_ns(), os.fstat(file.fileno())
     times = status.st_mtime_ns, status.st_ctime_ns
     is_settled = max(times) + _SETTLED_NS < now
-    return (str(path), status.st_dev, status.st_ino, status.st_size, *times) if is_settled else ()
+    return (str(file.name), status.st_dev, status.st_ino, status.st_size, *times) if is_settled else ()
 
 
 def _remembered(state: _State, digest: str) -> str:
