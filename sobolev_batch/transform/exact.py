@@ -243,17 +243,11 @@ def _two_sum(a: Array, b: Array) -> Pair:
     return high, (a - (high - shadow)) + (b - shadow)
 
 
-def _two_product(a: Array, b: Array) -> Pair:
-    """Return the rounded product and its rounding error: a * b = high + low exactly."""
-    high = a * b
-    a_high, a_low = _halves(a)
-    b_high, b_low = _halves(b)
-    return high, a_low * b_low - (((high - a_high * b_high) - a_low * b_high) - a_high * b_low)
-
-
 def _multiply(a: Pair, b: Pair) -> Pair:
     """Return the product of two double-double numbers, to about twice double precision."""
-    high, low = _two_product(a[0], b[0])
+    high, (a_high, a_low), (b_high, b_low) = a[0] * b[0], _halves(a[0]), _halves(b[0])
+    # What the rounded product of the first numbers lacks.
+    low = a_low * b_low - (((high - a_high * b_high) - a_low * b_high) - a_high * b_low)
     return _two_sum(high, low + (a[0] * b[1] + a[1] * b[0]))
 
 
