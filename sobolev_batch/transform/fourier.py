@@ -276,12 +276,10 @@ def projected_bytes(block: Block, settings: TransformSettings, *, triangles: int
 def require_inside(surface: Surface, lattice: Lattice) -> None:
     """Check that a surface lies within the lattice's period, and would not be folded back."""
     kind = "mesh" if kind_of(surface).triangles else "surface"
-    require_points_inside(np.stack(surface.extent.box), lattice, f"the {kind} reaches", "it")
+    require_points_inside(np.stack(surface.extent.box), lattice, f"the {kind} reaches")
 
 
-def require_points_inside(
-    coordinates: Reals, lattice: Lattice, subject: str = "the points reach", pronoun: str = "them"
-) -> None:
+def require_points_inside(coordinates: Reals, lattice: Lattice, subject: str = "the points reach") -> None:
     """Check that coordinates lie within the lattice's period; LatticeError otherwise."""
     reach = float(np.abs(coordinates).max(initial=0.0))
     if not reach < lattice.half_period:
@@ -289,7 +287,7 @@ def require_points_inside(
         raise LatticeError(
             f"{subject} to |coordinate| = {reach:.6g}, but the lattice (xi_max {lattice.xi_max:g}, "
             f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
-            f"take {f'M >= {intervals}, ' if intervals <= LARGEST_M else ''}a smaller xi_max, or scale {pronoun} down"
+            f"take {f'M >= {intervals}, ' if intervals <= LARGEST_M else ''}a smaller xi_max, or scale down"
         )
 
 
