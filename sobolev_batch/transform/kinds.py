@@ -158,8 +158,7 @@ class _Triangles(SurfaceKind):
         expected = [batch.expected_points for batch in triangles]
         ends = np.cumsum(expected)
         total = float(ends[-1])
-        margin = 0 if fits else max(expected)
-        count = math.ceil(total / (capacity - margin))
+        count = math.ceil(total / (capacity if fits else capacity - max(expected)))
         # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal number by
         # at most one of these.
         numbers = (np.concatenate([[0], ends[:-1]]) * count // total).astype(int).tolist()

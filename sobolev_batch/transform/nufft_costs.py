@@ -201,9 +201,8 @@ def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_byt
     """
 
     def fits(spec: NufftSpec) -> bool:
-        if costs.grid_cells(spec, workload) > costs.largest_grid:
-            return False
-        return costs.projected_bytes(spec, workload) <= allowed_bytes
+        is_allowed = costs.grid_cells(spec, workload) <= costs.largest_grid
+        return is_allowed and costs.projected_bytes(spec, workload) <= allowed_bytes
 
     if fits(whole):
         return whole
