@@ -80,22 +80,16 @@ def _first_difference(a: complex, b: complex, gap: float) -> complex:
 
 
 @part
-def _quotient(a: complex, b: complex, c: complex, ab: float, bc: float, ac: float) -> complex:
-    """Return the difference quotient of the two first differences that meet across the widest gap."""
+def _stable(a: complex, b: complex, c: complex, ab: float, bc: float, ac: float) -> complex:
+    """Return the divided difference: a series, or the quotient of the two first ones that meet at the widest gap."""
+    if max(abs(ab), abs(bc), abs(ac)) < _SERIES_GAP:
+        return b * complex(*_series(-ab, bc))
     of_ab, of_ac, of_bc = _first_difference(a, b, ab), _first_difference(a, c, ac), _first_difference(b, c, bc)
     if abs(ab) >= max(abs(ac), abs(bc)):
         return (of_bc - of_ac) / (1j * ab)
     if abs(ac) >= abs(bc):
         return (of_bc - of_ab) / (1j * ac)
     return (of_ac - of_ab) / (1j * bc)
-
-
-@part
-def _stable(a: complex, b: complex, c: complex, ab: float, bc: float, ac: float) -> complex:
-    """Return the divided difference from the exponentials at the corners, whatever the gaps."""
-    if max(abs(ab), abs(bc), abs(ac)) >= _SERIES_GAP:
-        return _quotient(a, b, c, ab, bc, ac)
-    return b * complex(*_series(-ab, bc))
 
 
 @part
