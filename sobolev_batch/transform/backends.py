@@ -37,6 +37,9 @@ _OUT_OF_MEMORY, _INSUFFICIENT_DRIVER, _NO_DEVICE = 2, 35, 100
 # Methods of cuFINUFFT. Each block of threads gathers its cells of the grid in shared memory: on an H100, 3 to 15 times
 # as fast as what the library chooses by itself, which is shared memory or, for want of it, global memory.
 _OUTPUT_DRIVEN, _AUTOMATIC = 3, 0
+# Its further options: the defaults differ from FINUFFT's and between versions.
+_GPU_OPTIONS = {"n_trans": 1, "gpu_sort": 1, "gpu_kerevalmeth": 1, "gpu_maxsubprobsize": 1024, "gpu_maxbatchsize": 1}
+_GPU_OPTIONS |= {"gpu_spreadinterponly": 0, "gpu_device_id": 0, "gpu_stream": 0, "debug": 0}
 # Of the device's memory, for the plans that are kept while it is idle, and their number at most.
 _KEPT_FRACTION, _KEPT_PLANS = 0.25, 4
 _LARGE_BYTES, _PAGE_BYTES, _TOUCHING_THREADS = 1 << 25, 1 << 12, 4
@@ -140,8 +143,8 @@ class Backend:
 
 
 def _common_options(spec: NufftSpec, adjoint: bool) -> dict[str, Any]:
-    options = {"eps": spec.eps, "dtype": spec.dtype, "upsampfac": spec.oversampling}
-    return {**options, "isign": 1 if adjoint else -1, "modeord": 0}
+    sign = 1 if adjoint else -1
+    return {"eps": spec.eps, "dtype": spec.dtype, "upsampfac": spec.oversampling, "isign": sign, "modeord": 0}
 
 
 CPU = Backend()
@@ -259,22 +262,8 @@ class Gpu(Backend):
     def _new_plan(self, spec: NufftSpec, adjoint: bool, method: int) -> Any:
         # A plan takes an error that an earlier one left behind for its own: asking for it resets it.
         self.runtime.cudaGetLastError()
-        # The defaults differ from FINUFFT's and between versions: dtype is complex64, upsampfac automatic.
-        return _plan_class(self.cufinufft)(
-            2 if adjoint else 1,
-            spec.shape,
-            **_common_options(spec, adjoint),
-            n_trans=1,
-            gpu_method=method,
-            gpu_sort=1,
-            gpu_kerevalmeth=1,
-            gpu_maxsubprobsize=1024,
-            gpu_maxbatchsize=1,
-            gpu_spreadinterponly=0,
-            gpu_device_id=0,
-            gpu_stream=0,
-            debug=0,
-        )
+        options = {**_common_options(spec, adjoint), **_GPU_OPTIONS, "gpu_method": method}
+        return _plan_class(self.cufinufft)(2 if adjoint else 1, spec.shape, **options)
 
     def __reduce__(self) -> tuple[object, ...]:
         return gpu_backend, ()
