@@ -126,16 +126,10 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
         except InputError as error:
             raise CannotStartError(f"its input cannot be written: {error}") from error
         filled = [PLACEHOLDER.sub(lambda found: str(files.get(found[1], found[0])), word) for word in words]
-        started = time.perf_counter()
+        started, marked = time.perf_counter(), environment() | {_MARK: str(folder)}
         try:
             process = subprocess.Popen(  # noqa: S603 -- the user permitted it
-                filled,
-                cwd=folder,
-                env=environment() | {_MARK: str(folder)},
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=err,
-                start_new_session=True,
+                filled, cwd=folder, env=marked, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True
             )
         except (OSError, ValueError) as error:
             problem = f"{words[0]} cannot be started on this machine: {_cannot_start(words[0], error)}"
