@@ -156,15 +156,13 @@ class Smooth(ABC):
     def area(self) -> float:
         """Area, in squared units of length: by quadrature, doubled until it settles to 1e-12, or InputError."""
         counts = _FIRST_NODES, _FIRST_NODES
-        area = self._area(counts)
-        change = math.inf
-        while change > _SETTLED * area and math.prod(doubled(counts)) <= _MOST_AREA_NODES:
+        area, before = self._area(counts), math.inf
+        while abs(area - before) > _SETTLED * area and math.prod(doubled(counts)) <= _MOST_AREA_NODES:
             counts = doubled(counts)
             area, before = self._area(counts), area
-            change = abs(area - before)
         if not (math.isfinite(area) and area > 0):
             raise InputError(f"a surface needs an area that is positive and finite, found {area:g}")
-        if change > _UNSETTLED * area:
+        if abs(area - before) > _UNSETTLED * area:
             both = f"{before:.6g} and, with twice the nodes, {area:.6g}"
             raise InputError(f"the area of the surface seems to be {both}: it is not smooth, or oscillates too fast")
         return area

@@ -62,8 +62,7 @@ def direct_transform(surface: Smooth, counts: Counts, frequencies: Reals) -> Com
 @lru_cache(maxsize=16)
 def exact_counts(surface: Smooth, highest: float) -> Counts:
     """Return twice the nodes along each parameter at which the transform converges up to a frequency."""
-    counts, _ = _refined(surface, highest, _EXACT_CHANGE, _MOST_EXACT_NODES)
-    return doubled(counts)
+    return doubled(_refined(surface, highest, _EXACT_CHANGE, _MOST_EXACT_NODES)[0])
 
 
 def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tuple[Counts, float]:
@@ -78,11 +77,9 @@ def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tu
         along = (twice[0], counts[1]), (counts[0], twice[1])
         finer = [direct_transform(surface, more, frequencies) for more in along]
         changes = [float(np.abs(more - values).max()) / surface.area for more in finer]
-        if sum(changes) <= tolerance:
-            return counts, sum(changes)
         coarse = [change > tolerance / 2 for change in changes]
         larger = (twice[0] if coarse[0] else counts[0], twice[1] if coarse[1] else counts[1])
-        if _too_many(surface, larger, most):
+        if sum(changes) <= tolerance or _too_many(surface, larger, most):
             return counts, sum(changes)
         counts = larger
         values = finer[coarse.index(True)] if sum(coarse) == 1 else direct_transform(surface, counts, frequencies)
@@ -97,10 +94,8 @@ def _first_counts(surface: Smooth, highest: float) -> Counts:
     """Return two nodes for each wavelength where nodes are farthest apart, and some more; odd numbers."""
     points = np.concatenate([batch for batch, _ in surface.nodes((_SPACING_NODES, _SPACING_NODES))], axis=1)
     grid = points.reshape(3, _SPACING_NODES, _SPACING_NODES)
-    counts = []
-    for axis in (1, 2):
-        widest = float(np.linalg.norm(np.diff(grid, axis=axis), axis=0).max())
-        # The number may exceed all bounds, and is refused then.
-        count = min(_MARGIN * _SPACING_NODES * widest * 2 * highest, float(MOST_NODES))
-        counts.append(math.ceil(count) + _EXTRA | 1)
-    return counts[0], counts[1]
+    widest = (float(np.linalg.norm(np.diff(grid, axis=axis), axis=0).max()) for axis in (1, 2))
+    # The numbers may exceed all bounds, and are refused then.
+    counts = (min(_MARGIN * _SPACING_NODES * width * 2 * highest, float(MOST_NODES)) for width in widest)
+    u, v = (math.ceil(count) + _EXTRA | 1 for count in counts)
+    return u, v
