@@ -93,10 +93,9 @@ def parse_off(data: bytes) -> Raw:
     vertex_count, face_count = int(counts[0]), int(counts[1])
     # Some programs write colours, or normals, without the letter.
     more = (0, 1) if has_colors else (0, 3, 4) if kind == "OFF" else (0,)
+    rows = chain(filter(None, [counts[3:]]), lines)
     try:
-        return _parsed_off(
-            vertex_count, face_count, least + 3 * has_colors, more, chain(filter(None, [counts[3:]]), lines)
-        )
+        return _parsed_off(vertex_count, face_count, least + 3 * has_colors, more, rows)
     except MeshError:
         # The lines of some programs hold many rows each. Without a count of edges, numbers may be those of another row.
         if len(counts) < 3 or sum(1 for _ in _off_lines(data)) > MOST_LINES * (vertex_count + face_count):

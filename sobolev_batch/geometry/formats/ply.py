@@ -235,9 +235,8 @@ def _columns(element: _Element, wanted: Sequence[str], body: memoryview, start: 
     else:
         values, sizes, end = _walked(element, wanted, count, body, start)
     for name in wanted:
-        values[name] = as_declared(
-            values[name], element.properties[name].declared, f"the PLY property {element.name} {name}"
-        )
+        owner = f"the PLY property {element.name} {name}"
+        values[name] = as_declared(values[name], element.properties[name].declared, owner)
     return values, sizes, end
 
 
