@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Sequence
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -156,20 +157,16 @@ def _of_second_format(nodes: _Numbers, cells: _Numbers) -> _Read:
         return _of_second_binary(nodes, cells)
     numbered = nodes.take(4 * nodes.count()).reshape(-1, 4)
     rows: dict[int, list[list[float]]] = {kind: [] for kind in _CORNERS}
-    count, numbers, place, sizes = cells.count(), cells.values.tolist(), 1, [1]
-    for _ in range(count):
+    count, numbers, cells.place = cells.count(), cells.values.tolist(), len(cells.values)
+    for place, end in pairwise(accumulate(cells.lines)):
         # Its number, its kind, and a count of tags, which come before its corners.
         number, kind, tags = map(int, numbers[place : place + 3])
-        begin, end = place + 3 + tags, place + 3 + tags + _corners(kind)
-        if tags < 0 or end > len(numbers):
-            raise MeshError("a section breaks off, or has wrong counts before")
-        rows[kind].append([(tags > 1 and numbers[place + 4]) or -number, *numbers[begin:end]])
-        sizes.append(end - place)
-        place = end
-    cells.place = place
-    # A number too many or too few would make other cells of all that follow.
-    if sizes != cells.lines:
-        raise MeshError("its cells are not the lines of $Elements: a line has a number too many or too few")
+        # A number too many or too few would make other cells of all that follow.
+        if tags < 0 or end != place + 3 + tags + _corners(kind):
+            raise MeshError("its cells are not the lines of $Elements: a line has a number too many or too few")
+        rows[kind].append([(tags > 1 and numbers[place + 4]) or -number, *numbers[place + 3 + tags : end]])
+    if cells.lines[0] != 1 or len(cells.lines) != 1 + count:
+        raise MeshError("a section breaks off, or has wrong counts before")
     return numbered, [(kind, np.array(found)) for kind, found in rows.items() if found]
 
 
