@@ -11,7 +11,7 @@ from pydantic import Field
 
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.sources.generated import Levels
+from sobolev_batch.sources.generated import Length, Levels, Number
 from sobolev_batch.sources.registry import MadeMember, Member, NestedSource, OtherSource, Several, Times, single_member
 
 # Measured peak of simplifying and of clustering, for each triangle of the original.
@@ -62,7 +62,7 @@ class _ReducingSource(NestedSource):
     """
 
     triangles: Several[Annotated[int, Field(ge=4, le=_MOST_TRIANGLES)]]
-    radius: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    radius: Length | None = None
 
     kind: ClassVar[str]
     library: ClassVar[str]
@@ -182,8 +182,8 @@ class FlowSource(NestedSource):
     """
 
     times: Times
-    period: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 5.0
-    strength: Annotated[float, Field(allow_inf_nan=False)] = 2.0
+    period: Length = 5.0
+    strength: Number = 2.0
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each time, in their order."""

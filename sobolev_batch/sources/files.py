@@ -66,6 +66,7 @@ def checked_list(value: object) -> str | tuple[MeshTable, ...] | None:
 
 def read_mesh_list(path: Path) -> tuple[MeshTable, ...]:
     """Return the meshes that a CSV file lists below the names of its columns; StudyError where it does not."""
+    this = f"meshes: the list {quoted(path.name)}"
     try:
         with open_regular(path) as file:
             length = os.fstat(file.fileno()).st_size
@@ -77,16 +78,14 @@ def read_mesh_list(path: Path) -> tuple[MeshTable, ...]:
                 file, header=None, dtype=str, keep_default_na=False, encoding="utf-8-sig", skipinitialspace=True
             )
     except (OSError, ValueError) as error:
-        raise StudyError(f"meshes: the list {quoted(path.name)} cannot be read: {str(error).strip()}") from error
+        raise StudyError(f"{this} cannot be read: {str(error).strip()}") from error
     header = cells.iloc[0].fillna("").str.strip()
     frame = cells.iloc[1:].fillna("").set_axis(header, axis=1)
     if len(repeated := header[header.duplicated()]):
-        raise StudyError(f"meshes: the list {quoted(path.name)} has the column {quoted(repeated.iloc[0])} twice")
+        raise StudyError(f"{this} has the column {quoted(repeated.iloc[0])} twice")
     if "path" not in frame or frame.empty:
-        raise StudyError(
-            f"meshes: the list {quoted(path.name)} needs a column path and a line for each mesh; found "
-            f"{len(frame)} lines of the columns {quoted(list(frame.columns))}"
-        )
+        found = f"{len(frame)} lines of the columns {quoted(list(frame.columns))}"
+        raise StudyError(f"{this} needs a column path and a line for each mesh; found {found}")
     for key in frame.columns.difference(_TEXTS):
         numbers = pd.to_numeric(frame[key].str.strip(), errors="coerce")
         is_number = numbers.notna() | (frame[key].str.strip() == "")
@@ -96,7 +95,7 @@ def read_mesh_list(path: Path) -> tuple[MeshTable, ...]:
     try:
         return _listed(frame.to_dict(orient="records"))
     except ValueError as error:
-        raise StudyError(f"meshes: the list {quoted(path.name)}: {error}") from error
+        raise StudyError(f"{this}: {error}") from error
 
 
 def number_as_text(number: float) -> str:
