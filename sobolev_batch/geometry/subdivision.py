@@ -66,7 +66,7 @@ class Edges:
     @classmethod
     def from_mesh(cls, mesh: Mesh) -> Self:
         """Return the edges of a mesh."""
-        sides = np.sort(np.asarray(mesh.triangles)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        sides = np.sort(mesh.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         # One number for each pair of vertices: they are sorted ten times as fast as rows.
         count = len(mesh.vertices)
         pairs, edges = np.unique(sides[:, 1] * count + sides[:, 0], return_inverse=True)
@@ -81,17 +81,16 @@ class Edges:
     @cached_property
     def lengths(self) -> Reals:
         """Lengths (e,), in units of length."""
-        vertices = np.asarray(self.mesh.vertices)
-        return np.asarray(np.linalg.norm(vertices[self.ends[:, 0]] - vertices[self.ends[:, 1]], axis=1))
+        first, second = self.mesh.vertices[self.ends.T]
+        return np.asarray(np.linalg.norm(first - second, axis=1))
 
     def split(self, marks: Marks) -> Mesh:
         """Return the mesh with new vertices, after its own, at the middles of marked edges; of two cuts the shorter."""
-        count = len(self.mesh.vertices)
+        old, count = self.mesh.vertices, len(self.mesh.vertices)
         middles = np.full(len(self.ends), -1, dtype=np.int64)
         middles[marks] = count + np.arange(np.count_nonzero(marks))
-        old = np.asarray(self.mesh.vertices)
         vertices = np.concatenate([old, old[self.ends[marks]].mean(axis=1)])
-        triangles, on_sides = np.asarray(self.mesh.triangles, dtype=np.int64), middles[self.sides]
+        triangles, on_sides = self.mesh.triangles, middles[self.sides]
         # Turned so that the first side is marked, and of three sides with two marks the last one is not.
         first = np.argmax((on_sides >= 0) & (np.roll(on_sides, 1, axis=1) < 0), axis=1)
         columns = (first[:, None] + np.arange(3)) % 3
@@ -128,5 +127,4 @@ def _icosahedron() -> Mesh:
 
 def _projected(mesh: Mesh) -> Mesh:
     """Return the mesh with its vertices moved to the unit sphere."""
-    vertices = np.asarray(mesh.vertices)
-    return Mesh(vertices / np.linalg.norm(vertices, axis=1)[:, None], mesh.triangles)
+    return Mesh(mesh.vertices / np.linalg.norm(mesh.vertices, axis=1)[:, None], mesh.triangles)
