@@ -43,8 +43,7 @@ class FaceArrays:
 
     def part(self, which: slice | Indices) -> Self:
         """Return some of the triangles, with all vertices, in contiguous rows."""
-        if not isinstance(which, slice):
-            which = self.backend.upload(which)
+        which = which if isinstance(which, slice) else self.backend.upload(which)
         corners = np.ascontiguousarray(self.corners[:, which], like=self.corners)
         return replace(self, corners=corners, areas=self.areas[which], radii=self.radii[which])
 

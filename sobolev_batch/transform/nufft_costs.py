@@ -208,9 +208,8 @@ def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_byt
         return whole
     candidates: list[NufftSpec] = []
     least_bytes = math.inf
-    batches = [whole.batch]
-    while batches[-1] // 2 >= _SMALLEST_BATCH:
-        batches.append(batches[-1] // 2)
+    halvings = range(max(1, (whole.batch // _SMALLEST_BATCH).bit_length()))
+    batches = (whole.batch >> number for number in halvings)
     for batch, sigma in product(batches, costs.oversamplings(whole)):
         shapes = sub_shapes(whole.shape, sigma)
         smaller = [replace(whole, shape=shape, oversampling=sigma, batch=batch) for shape in shapes]
