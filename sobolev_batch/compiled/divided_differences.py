@@ -27,6 +27,7 @@ _FINE_SQUARE = (_SERIES_GAP / _TURN) ** 2
 _LANES = 32
 # Splits a double into halves of 26 bits each.
 _SPLITTER = 2.0**27 + 1
+_Edges = tuple[float, float, float, float, float, float]
 
 
 @part
@@ -93,23 +94,21 @@ def _stable(a: complex, b: complex, c: complex, ab: float, bc: float, ac: float)
 
 
 @part
-def _edges(vertices: Reals, triangle: Indices) -> tuple[float, float, float, float, float, float]:
+def _edges(vertices: Reals, triangle: Indices) -> _Edges:
     """Return the edge from the first corner to the second, and from there to the third."""
     a, b, c = vertices[triangle[0]], vertices[triangle[1]], vertices[triangle[2]]
     return b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - b[0], c[1] - b[1], c[2] - b[2]
 
 
 @part
-def _longest_square(edges: tuple[float, float, float, float, float, float]) -> float:
+def _longest_square(edges: _Edges) -> float:
     px, py, pz, qx, qy, qz = edges
     third = (px + qx) ** 2 + (py + qy) ** 2 + (pz + qz) ** 2
     return max(px * px + py * py + pz * pz, qx * qx + qy * qy + qz * qz, third)
 
 
 @part
-def _gaps(
-    edges: tuple[float, float, float, float, float, float], u: float, v: float, w: float
-) -> tuple[float, float, float]:
+def _gaps(edges: _Edges, u: float, v: float, w: float) -> tuple[float, float, float]:
     """Return the gaps along both edges, and along both together, in radians."""
     ab = -_TURN * (u * edges[0] + v * edges[1] + w * edges[2])
     bc = -_TURN * (u * edges[3] + v * edges[4] + w * edges[5])

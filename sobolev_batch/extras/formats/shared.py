@@ -22,17 +22,15 @@ BYTE_ORDERS: dict[str, Literal["<", ">"]] = {"LittleEndian": "<", "BigEndian": "
 # The command that takes the surface of cells with volume.
 SURFACE = "python -c \"import pyvista; pyvista.read('scan{}').extract_surface().triangulate().save('scan.vtp')\""
 _INTEGERS = re.compile("[-+0-9]*")
+_Event = tuple[str, str, dict[str, str]]
 
 
-def xml_events(
-    data: bytes, kind: str, most_elements: int = _MOST_ELEMENTS
-) -> Iterator[tuple[str, str, dict[str, str]]]:
+def xml_events(data: bytes, kind: str, most_elements: int = _MOST_ELEMENTS) -> Iterator[_Event]:
     """Parse XML a little at a time, and refuse what would take memory out of proportion in a file of some kind.
 
     Yield ("start", name, attributes) and ("end", name, {}) of each element, and ("text", piece, {}) between them.
     """
-    events: list[tuple[str, str, dict[str, str]]] = []
-    heard = 0
+    events, heard = list[_Event](), 0
 
     def refuse_entity(name: str, *_: object) -> None:
         raise MeshError(f"the XML declares the entity {name[:40]!r}; a {kind} file has none, write it without")

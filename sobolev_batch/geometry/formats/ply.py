@@ -129,9 +129,7 @@ def announced_size(header: bytes, length: int) -> tuple[int, float]:
     return triangles, memory * triangles + _VERTEX_MEMORY * max(0.0, vertices - triangles / 2)
 
 
-def write_ply(
-    mesh: Mesh, values: Mapping[str, NDArray[np.floating]] | None = None, comments: Sequence[str] = ()
-) -> bytes:
+def write_ply(mesh: Mesh, values: Mapping[str, NDArray[Any]] | None = None, comments: Sequence[str] = ()) -> bytes:
     """Return a binary PLY file, all digits kept, with further values (n,) of the vertices by their names."""
     columns = {**dict(zip("xyz", mesh.vertices.T, strict=True)), **(values or {})}
     vertices = np.empty(len(mesh.vertices), [(name, f"<f{one.dtype.itemsize}") for name, one in columns.items()])
