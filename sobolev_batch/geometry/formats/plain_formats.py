@@ -7,6 +7,7 @@ import io
 import re
 from array import array
 from collections.abc import Iterator
+from functools import partial
 from itertools import chain, islice
 from typing import Any
 
@@ -240,9 +241,7 @@ def write_stl(mesh: Mesh) -> bytes:
 def _text_lines(data: bytes) -> Iterator[str]:
     """Yield the lines of a text one by one, each with a line feed at its end, which the last may lack."""
     reader = io.TextIOWrapper(io.BytesIO(data), "utf-8", errors="replace")
-    number = 0
-    while line := reader.readline(_LONGEST_LINE + 1):
-        number += 1
+    for number, line in enumerate(iter(partial(reader.readline, _LONGEST_LINE + 1), ""), 1):
         if len(line) > _LONGEST_LINE:
             raise MeshError(f"line {number} has more than {_LONGEST_LINE} characters; shorten it, or cut its polygon")
         yield line
