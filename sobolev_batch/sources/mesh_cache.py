@@ -4,6 +4,7 @@ import hashlib
 import json
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
@@ -57,20 +58,16 @@ class MeshCache:
         """Return the mesh that is kept under a digest; None where there is none, or a damaged one."""
         kept = self._entry(digest).get("mesh")
         data = self.folder.read(f"{digest}.ply") if kept else None
-        if data is None:
-            return None
-        try:
-            mesh = Mesh(*parse_ply(data))
-        except (MeshError, ValueError):
-            return None
-        return mesh if mesh.digest == kept else None
+        with suppress(MeshError, ValueError):
+            if data is not None and (mesh := Mesh(*parse_ply(data))).digest == kept:
+                return mesh
+        return None
 
     def cost(self, digest: str) -> Cost | None:
         """Return what the last attempt to make a mesh took; None where there was none."""
-        try:
+        with suppress(KeyError, TypeError, ValueError):
             return Cost(**{name: float(value) for name, value in dict(self._entry(digest)["cost"]).items()})
-        except (KeyError, TypeError, ValueError):
-            return None
+        return None
 
     def write(self, digest: str, made: Made, about: Mapping[str, Any]) -> None:
         """Keep what was made, or what a failure took, with a description of what made it."""
@@ -109,8 +106,7 @@ class MeshCache:
         return self.asked[key]
 
     def _entry(self, digest: str) -> dict[str, Any]:
-        try:
-            entry = json.loads(self.folder.read(f"{digest}.json") or b"{}")
-        except ValueError:
-            return {}
-        return entry if isinstance(entry, dict) else {}
+        with suppress(ValueError):
+            if isinstance(entry := json.loads(self.folder.read(f"{digest}.json") or b"{}"), dict):
+                return entry
+        return {}
