@@ -231,9 +231,8 @@ def _quotient(exponentials: Sequence[Array], ab: Array, bc: Array) -> Array:
 def _first_difference(a: Array, b: Array, gap: Array) -> Array:
     """Return the first divided difference (exp(iβ) - exp(iα)) / (i (β - α))."""
     wide = np.abs(gap) > 1
-    denominator = np.where(wide, gap, 1.0)
     near = a * np.exp(0.5j * gap) * np.sinc(gap / (2 * np.pi))
-    return np.where(wide, (b - a) / (1j * denominator), near)
+    return np.where(wide, (b - a) / (1j * np.where(wide, gap, 1.0)), near)
 
 
 def _two_sum(a: Array, b: Array) -> Pair:

@@ -75,8 +75,7 @@ class TriangleRule:
     @property
     def cost(self) -> float:
         """Points for each triangle of a large closed mesh, once shared nodes are merged."""
-        corners = 0.5 if self.corner_weight else 0.0
-        return corners + 1.5 * len(self.edge_nodes[1]) + len(self.inner_nodes[1])
+        return 0.5 * bool(self.corner_weight) + 1.5 * len(self.edge_nodes[1]) + len(self.inner_nodes[1])
 
     @property
     def shares(self) -> bool:
