@@ -60,7 +60,7 @@ def checked_list(value: object) -> str | tuple[MeshTable, ...] | None:
     if value is None or (isinstance(value, str) and value):
         return value
     if not isinstance(value, list | tuple) or not value or not all(isinstance(table, Mapping) for table in value):
-        raise ValueError(f'must be the path of a CSV file, such as "meshes.csv", or a list of tables as {_EXAMPLE}')
+        raise ValueError(f'must be the path of a CSV file, such as "meshes.csv", or a list of tables like {_EXAMPLE}')
     return _listed(value)
 
 

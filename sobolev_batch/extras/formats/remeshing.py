@@ -90,7 +90,7 @@ def parse_gmsh(data: bytes) -> Raw:
     repeated -= sum(map(len, kept))
     volumes = sum(len(corners) for kind, corners in rows if kind in _WITH_VOLUME)
     if volumes and b"$PartitionedEntities" in data:
-        raise MeshError(f"it has partitions, and the faces between them are inside; join them: {_SAVED.format(22)}")
+        raise MeshError(f"it has partitions, and the faces between them are inside; save it whole: {_SAVED.format(22)}")
     # Nodes have any numbers, in any order.
     order_of_nodes = np.argsort(numbered[:, 0])
     known = numbered[order_of_nodes, 0]
