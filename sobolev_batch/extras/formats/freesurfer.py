@@ -12,7 +12,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import Raw, reals
 
-# lh.pial, rh.white, sub-01.lh.sphere.reg, inner_skull.surf; but lh.aparc.annot has values at vertices.
+# Names of surfaces: lh.pial, rh.white, sub-01.lh.sphere.reg, inner_skull.surf; lh.aparc.annot has values at vertices.
 _NAME = re.compile(r"(?:^|[._-])[lr]h\.[^.].*(?<!\.annot)(?<!\.label)(?<!\.mgh)(?<!\.mgz)$|.\.surf$")
 _MAGIC = b"\xff\xff\xfe"
 # The two lines after the number of the format: who made the file and when, and an empty one.
@@ -23,15 +23,6 @@ _VOLUME = (b"\0\0\0\x14", b"\0\0\0\2\0\0\0\0\0\0\0\x14", _AT_SCANNER := b"\0\0\0
 # The middle of that volume, where the coordinates of the surface have their origin, within some hundred bytes.
 _MIDDLE = re.compile(rb"valid = 1\b.*\ncras\s{0,9}=([^\n]{1,200})", re.DOTALL)
 _VOLUME_BYTES = 4096
-
-
-def is_freesurfer_name(name: str) -> bool:
-    """Return whether a file's name, without .gz, is one that FreeSurfer gives to surfaces.
-
-    >>> [is_freesurfer_name(name) for name in ("lh.pial", "sub-01_rh.white", "inner_skull.surf", "ball.pial")]
-    [True, True, True, False]
-    """
-    return _NAME.search(name.lower()) is not None
 
 
 def parse_freesurfer(data: bytes) -> Raw:
@@ -62,4 +53,4 @@ def parse_freesurfer(data: bytes) -> Raw:
     return Raw(coordinates.reshape(-1, 3), corners.reshape(-1, 3), notes if is_shifted else ())
 
 
-FORMATS = (Format(("freesurfer",), parse_freesurfer, 18, 80, is_name=is_freesurfer_name),)
+FORMATS = (Format(("freesurfer",), parse_freesurfer, 18, 80, is_name=lambda name: bool(_NAME.search(name))),)
