@@ -66,7 +66,5 @@ def _require_members(study: Study, only: Sequence[str]) -> None:
         except InputError:
             return  # The run reports what cannot be listed, and may have any name.
         unknown = [name for name in unknown if not one.chosen([name])]
-    if unknown:
-        raise StudyError(
-            f"no object, family or member of the study is {quoted(unknown[0])}; {known_names(unknown[0], known)}"
-        )
+    for name in unknown:
+        raise StudyError(f"no object, family or member of the study is {quoted(name)}; {known_names(name, known)}")

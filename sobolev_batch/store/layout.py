@@ -172,9 +172,7 @@ class Store:
             raise ForeignError(f"{self.path}: {problem}")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
         if self.is_unfinished:
-            raise StoreError(
-                f"{self.path}: the store is being laid out, or whoever did that was interrupted; run the study again"
-            )
+            raise StoreError(f"{self.path}: it is being laid out, or that was interrupted; run the study again")
         if "schema_version" not in attributes or "study" not in attributes:
             raise ForeignError(f"{self.path}: a zarr store, but not one of a study")
         version = attributes["schema_version"]
@@ -245,9 +243,7 @@ class Store:
     def document(self, name: str) -> Document:
         """Return the metadata document of a node."""
         if name not in self.documents and not (self.exists() and name in self.documents):
-            raise StoreError(
-                f"{self.path}: the store is incomplete: it has no {name}; remove it and run the study again"
-            )
+            raise StoreError(f"{self.path}: the store is incomplete, without {name}; remove it and run the study again")
         return self.documents[name]
 
     def stored_document(self, name: str) -> Document | None:

@@ -254,15 +254,11 @@ class Location:
 
 def _folder_name(store: str | Path) -> str:
     if not str(store) or "\0" in str(store):
-        raise StoreError(
-            f"the path of the store is empty or has a null character, found {store!r}; name a folder or a URL"
-        )
+        raise StoreError(f"a store's path is not empty and has no null character, found {store!r}; name another")
     first = next(iter(path_of(store).parts), "")
     if first.endswith(":") and first[:-1] in available_protocols():
         # The rest may hold a password.
-        raise StoreError(
-            f"this begins with {first}/ and a URL with {first}//; a Path cannot hold a URL, give it as a string"
-        )
+        raise StoreError(f"this begins with {first}/ and a URL with {first}//; a Path cannot hold a URL, a text can")
     # It is expanded here, since libraries underneath would do so in some places and not in others.
     try:
         return str(Path(store).expanduser())

@@ -58,9 +58,7 @@ def _line_of_text(longest: int, forbidden: str = "") -> AfterValidator:
 
     def check(text: str) -> str:
         if (problem := name_problem(text, longest, forbidden)) is not None:
-            raise ValueError(
-                f"1 to {longest} visible characters are needed, blanks only between them{without}; {problem}"
-            )
+            raise ValueError(f"1 to {longest} visible characters are needed, blanks only between{without}; {problem}")
         return text
 
     return AfterValidator(check)

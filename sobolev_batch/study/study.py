@@ -120,9 +120,7 @@ class StudyObject:
                 members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(self.reference, self.folder)
         columns = dict.fromkeys(name for _, member in members.values() for name, _ in member.metadata)
         if same := duplicate_names(columns):
-            raise StudyError(
-                f"metadata: the names {' and '.join(map(quoted, same[0]))} differ in case alone; rename one"
-            )
+            raise StudyError(f"metadata: {' and '.join(map(quoted, same[0]))} differ in case alone; rename one")
         return members
 
     def chosen(self, only: Sequence[str]) -> set[str]:
@@ -309,9 +307,7 @@ StudyLike = Study | str | Path
 def as_study(study: StudyLike) -> Study:
     """Return a study, which may be given by the path of its file."""
     if isinstance(study, Mapping):
-        raise StudyError(
-            "a study is a Study or the path of its file, found a mapping; pass Study.from_table(...) of it"
-        )
+        raise StudyError("a study is a Study or the path of its file, found a mapping; pass Study.from_table(...)")
     return study if isinstance(study, Study) else Study.from_toml(study)
 
 

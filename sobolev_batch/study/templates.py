@@ -111,9 +111,7 @@ def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
     for template in templates:
         match = re.compile(_pattern(template)).fullmatch
         if not (found := {matched["object"] for matched in map(match, _matching(template, folder)) if matched}):
-            raise StudyError(
-                f"no file gives {OBJECT} of {template!r} one name; it stands for a part of a path, without /"
-            )
+            raise StudyError(f"no file gives {OBJECT} of {template!r} one name; it stands for a part without /")
         names |= found
     return sorted(names, key=natural_key)
 

@@ -179,9 +179,7 @@ def memory_limit(memory: float | str, workers: int) -> int:
     """Return the memory of each worker in bytes; refuse too little for one, or more than there is for all."""
     limit = byte_count(memory)
     if limit < _LEAST_BYTES:
-        raise InputError(
-            f"the memory of a worker must be at least {format_bytes(_LEAST_BYTES)}, found {memory!r}; give it more"
-        )
+        raise InputError(f"the memory of a worker must be at least {format_bytes(_LEAST_BYTES)}, found {memory!r}")
     require_machine_memory(limit, "the memory of a worker")
     require_machine_memory(workers * limit, f"the memory of {workers} workers", "for each, or take fewer")
     return limit
