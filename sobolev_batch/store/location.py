@@ -29,14 +29,7 @@ from zarr.core.common import AccessModeLiteral
 from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore
 
-from sobolev_batch.errors import (
-    DamageError,
-    ForeignError,
-    SobolevBatchError,
-    SpaceError,
-    StoreError,
-    is_for_want_of_space,
-)
+from sobolev_batch.errors import DamageError, ForeignError, SpaceError, StoreError, is_for_want_of_space
 from sobolev_batch.parameters import path_of
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
@@ -197,9 +190,8 @@ class Location:
 
     def lacks_folder(self) -> str:
         """Return that no folder can hold a store here, if so: none is made, since its name may be a mistake."""
-        parent = Path(self.name).absolute().parent
-        is_there, problem = self.scheme or parent.is_dir(), f"there is no folder {parent} to hold the store"
-        return "" if is_there else f"{self.name}: {problem}; make it first"
+        is_there = self.scheme or (parent := Path(self.name).absolute().parent).is_dir()
+        return "" if is_there else f"{self.name}: there is no folder {parent} to hold the store; make it first"
 
     def require_free(self, besides: Collection[str] = ()) -> None:
         """Check that a store may be created here, without writing."""
@@ -224,14 +216,14 @@ class Location:
             self.fence()
         try:
             yield
-        except SobolevBatchError:
+        except StoreError:
             raise
         except Exception as error:
             if not self.scheme and not isinstance(error, OSError):
                 raise  # This is a defect.
             text = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
-            if not self.scheme and getattr(error, "filename", None):
-                text += f": {getattr(error, 'filename', None)}"
+            if not self.scheme and (place := getattr(error, "filename", None)):
+                text += f": {place}"
             is_full = is_for_want_of_space(error)
             text += "; make room there" if is_full else ""
             if self.scheme:
