@@ -6,16 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    SerializeAsAny,
-    ValidationInfo,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, SerializeAsAny, ValidationInfo, model_validator
 from pydantic_core import PydanticKnownError
 
 from sobolev_batch.arrays import ComplexDtype
@@ -85,10 +76,8 @@ Name = Annotated[str, _line_of_text(100, "/\\")]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class Section(BaseModel):
+class Section(BaseModel, frozen=True, extra="forbid", strict=True):
     """A section of a study file: frozen, of strict types, without unknown keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     def settings(self) -> Any:
         """Return what the section says, in the terms of the package."""
