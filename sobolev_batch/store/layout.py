@@ -350,10 +350,8 @@ class Store:
 
     def consolidate(self) -> None:
         """Collect the metadata of all nodes at the root, so that one read opens everything, with a new digest."""
-        root = self._root()
-        root["attributes"][DIGEST] = self._digest(root)
-        self.documents[""]["attributes"][DIGEST] = root["attributes"][DIGEST]
-        self.location.write({ROOT: json.dumps(root).encode()})
+        self.documents[""]["attributes"][DIGEST] = self._digest()
+        self.location.write({ROOT: json.dumps(consolidated(self.documents)).encode()})
 
     def has_digest(self, *, is_thorough: bool = False) -> bool:
         """Return whether tables, coordinates and metadata are those that were written together.
@@ -363,19 +361,15 @@ class Store:
         try:
             if not is_thorough:
                 self._recall()
-            return bool(self.documents[""]["attributes"].get(DIGEST) == self._digest(self._root()))
+            return bool(self.documents[""]["attributes"].get(DIGEST) == self._digest())
         except (DamageError, ValueError, TypeError, KeyError):
             # zarr has no exception of its own for metadata that make no sense.
             return False
 
-    def _root(self) -> Document:
-        """Return the document at the root with those of all nodes, as zarr consolidates them, without the digest."""
+    def _digest(self) -> str:
+        """Return the SHA-256 of the root, without this, and of all keys of tables, coordinates and metadata."""
         root = consolidated(self.documents)
         root["attributes"].pop(DIGEST, None)
-        return root
-
-    def _digest(self, root: Document) -> str:
-        """Return the SHA-256 of a root and of all keys of the tables, coordinates and metadata that it lists."""
         # The group of records has the state of the latest run.
         keys = {f"{name}/{ROOT}": MOST_BYTES for name in self.documents if name not in ("", RECORDS)}
         for name in self.whole_arrays():
