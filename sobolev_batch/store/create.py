@@ -72,11 +72,10 @@ def give_up(location: Location) -> None:
 def list_records(store: Store) -> None:
     """List the group of records, whose own document has the record of a run that may be going on."""
     store.documents[layout.RECORDS] = group_document({})
-    document = None
-    with suppress(StoreError):  # It is damaged.
-        document = store.stored_document(layout.RECORDS)
-    if document is None:
-        store.location.write({f"{layout.RECORDS}/{ROOT}": json.dumps(store.documents[layout.RECORDS]).encode()})
+    with suppress(StoreError):  # A damaged one is replaced.
+        if store.stored_document(layout.RECORDS) is not None:
+            return
+    store.location.write({f"{layout.RECORDS}/{ROOT}": json.dumps(store.documents[layout.RECORDS]).encode()})
 
 
 def prepare_store(location: str | Path | Location, plan: Plan) -> Store:

@@ -168,22 +168,19 @@ class Store:
         """
         if not self.exists() or self.documents[""].get("node_type") != "group":
             is_absent = not self.location.scheme and not os.path.lexists(self.path)
-            problem = "it does not exist" if is_absent else "it holds no store of a study"
-            raise ForeignError(f"{self.path}: {problem}")
+            raise ForeignError(f"{self.path}: it {'does not exist' if is_absent else 'holds no store of a study'}")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
         if self.is_unfinished:
             raise StoreError(f"{self.path}: it is being laid out, or that was interrupted; run the study again")
         if "schema_version" not in attributes or "study" not in attributes:
             raise ForeignError(f"{self.path}: a zarr store, but not one of a study")
-        version = attributes["schema_version"]
-        if version != SCHEMA_VERSION:
+        if (version := attributes["schema_version"]) != SCHEMA_VERSION:
             raise ForeignError(
                 f"{self.path}: its schema has version {version}, this program reads {SCHEMA_VERSION}; "
                 "run the study again into another store, or read this one with the version that has written it"
             )
         has_objects = OBJECTS in attributes["study"]
-        kind: Any = _OF_OBJECTS if has_objects else _OF_ONE
-        record_in(kind, attributes["study"], f'{self.path}: the attribute "study" of {ROOT}')
+        record_in(_OF_OBJECTS if has_objects else _OF_ONE, attributes["study"], f"{self.path}: study in {ROOT}")
         if of_objects and not has_objects:
             raise ForeignError(f"{self.path}: the store of one object, and the study names several; name another store")
         if has_objects and of_objects is False:

@@ -32,8 +32,6 @@ from sobolev_batch.store.location import Location
 _log = logging.getLogger(__name__)
 
 _TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
-# In these states, a process only waits for its parent to take notice.
-_ENDED = ("Z", "X")
 
 LOCK_KEY = "claim.json"
 # This one is held during a takeover, since several drivers may try.
@@ -120,8 +118,7 @@ class Lock:
     def _require(self, location: Location, part: Literal["run", "holder"]) -> None:
         current = Lock.read(location)
         if current is None or getattr(current, part) != getattr(self, part):
-            others = "the store was unlocked, or its run is over"
-            others = others if current is None else f"{current.driver} has it now"
+            others = f"{current.driver} has it now" if current else "the store was unlocked, or its run is over"
             raise LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
 
 
@@ -205,9 +202,8 @@ def _process_mark(number: int) -> str:
         return ""
     # The name in brackets may hold anything. The start is counted from the boot, which no setting of the clock moves.
     state, started = (fields.rpartition(")")[2].split()[index] for index in (0, 19))
-    if state in _ENDED:
-        return ""
-    return machine and f"{machine}/{number}@{started}"
+    # In these states, it only waits for its parent to take notice.
+    return "" if state in ("Z", "X") else machine and f"{machine}/{number}@{started}"
 
 
 def _machine() -> str:

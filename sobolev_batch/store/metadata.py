@@ -143,12 +143,11 @@ def _problem_of_array(node: str, document: Document) -> str:
             return f"the {key} of {node} is {_shown(value)}"
     shape, grid = document.get("shape"), document["chunk_grid"].get("configuration")
     chunk = grid.get("chunk_shape") if isinstance(grid, dict) else grid
-    if not _is_shape(shape, 0) or not _is_shape(chunk, 1) or len(shape) != len(chunk):
-        return f"{node} has the shape {_shown(shape)} in chunks of {_shown(chunk)}"
-    most = math.inf if len(shape) > 1 and _OF_MESHES.fullmatch(node) else _MOST_ELEMENTS.get(len(shape), math.inf)
-    if math.prod(shape) > most or max([*shape, *chunk], default=0) > _LONGEST_AXIS:
-        return f"{node} has the shape {_shown(shape)} in chunks of {_shown(chunk)}"
-    return ""
+    if _is_shape(shape, 0) and _is_shape(chunk, 1) and len(shape) == len(chunk):
+        most = math.inf if len(shape) > 1 and _OF_MESHES.fullmatch(node) else _MOST_ELEMENTS.get(len(shape), math.inf)
+        if math.prod(shape) <= most and max([*shape, *chunk], default=0) <= _LONGEST_AXIS:
+            return ""
+    return f"{node} has the shape {_shown(shape)} in chunks of {_shown(chunk)}"
 
 
 def _is_shape(shape: Any, least: int) -> TypeGuard[list[int]]:

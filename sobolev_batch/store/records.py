@@ -10,6 +10,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from itertools import groupby
 from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast
 
 from pydantic import ConfigDict
@@ -272,14 +273,10 @@ class Records(Generic[RecordType]):
         Returns:
             Rows that keep their own chunks, as these are.
         """
-        step = self._rows_per_page
-        pages: dict[int, list[int]] = {}
-        kept: list[int] = []
-        for row in self.store.stored_chunks(RECORD):
-            pages.setdefault(row // step, []).append(row)
+        step, kept = self._rows_per_page, list[int]()
         most_bytes = largest_chunk_bytes(self.store.document(PAGE))
-        for page, own in pages.items():
-            start = page * step
+        for page, stored in groupby(self.store.stored_chunks(RECORD), key=lambda row: row // step):
+            start, own = page * step, list(stored)
             of_page = records[start : start + step]
             lines = [record.to_json(start + i) for i, record in enumerate(of_page) if record]
             # In a folder, few records are as quick to read, and less is lost with one of them.
