@@ -20,11 +20,11 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore, WrapperStore
 
 from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.store.encoding import ROOT, TEXTS
 from sobolev_batch.store.metadata import Document, chunk_shape, consolidated
 
 CHANGED = "it is not what was written"
 CHECKSUM_BYTES = 4
-_ROOT = "zarr.json"
 # The codec of texts writes their number, and the length of each, in as many bytes.
 _COUNT_BYTES = 4
 # Records have checksums of all blocks of a field, and are the longest texts.
@@ -56,7 +56,7 @@ class CheckedStore(WrapperStore[ZarrStore]):
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the bytes of a key."""
-        if key == _ROOT and "" in self._documents:
+        if key == ROOT and "" in self._documents:
             # What is not used is not there.
             return prototype.buffer.from_bytes(json.dumps(consolidated(self._documents)).encode())
         group, _, place = key.partition("/")
@@ -75,7 +75,7 @@ class CheckedStore(WrapperStore[ZarrStore]):
         content = None if problem else await super().get(key, prototype)
         if content is not None:
             problem = problem_of_chunk(content.as_numpy_array(), document)
-        elif not problem and document["data_type"] != "string" and not await self._store.exists(_ROOT):
+        elif not problem and document["data_type"] != "string" and not await self._store.exists(ROOT):
             # All its numbers would read as missing ones.
             raise StoreError(
                 f"{self._name}: it is not there for process {os.getpid()} of {socket.gethostname()}; a worker of your "
@@ -119,14 +119,8 @@ def problem_of_chunk(content: NDArray[np.uint8], document: Mapping[str, Any]) ->
 def _problem_of_texts(data: bytes, count: int) -> str:
     if int.from_bytes(data[:_COUNT_BYTES], "little") != count or len(data) < _COUNT_BYTES * (1 + count):
         return f"it does not hold {count} texts"
-    start = _COUNT_BYTES
-    for _ in range(count):
-        end = start + _COUNT_BYTES + int.from_bytes(data[start : start + _COUNT_BYTES], "little")
-        if end > len(data):
-            return "a text in it is cut short"
-        try:
-            data[start + _COUNT_BYTES : end].decode()
-        except UnicodeDecodeError:
-            return "a text in it is not UTF-8"
-        start = end
-    return "" if start == len(data) else "it holds more than its texts"
+    try:
+        written = bytes(TEXTS.encode(TEXTS.decode(data)))
+    except ValueError as error:
+        return f"its texts make no sense: {error}"
+    return "" if written == data else "it holds more than its texts"

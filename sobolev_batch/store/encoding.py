@@ -24,7 +24,8 @@ _PADDING: dict[str, Any] = {"O": "", "f": np.nan, "c": complex(np.nan, np.nan)}
 # NaN as xarray writes it in attributes: its bytes in base64.
 _NAN = "AAAAAAAA+H8="
 
-_strings = VLenUTF8()
+# The codec of texts.
+TEXTS = VLenUTF8()
 
 
 def array_keys(
@@ -83,7 +84,7 @@ def chunks_of(values: NDArray[Any], steps: Sequence[int]) -> Iterator[tuple[tupl
             whole[tuple(map(slice, chunk.shape))] = chunk
             chunk = whole
         if chunk.dtype == object:
-            data = bytes(_strings.encode(np.ascontiguousarray(chunk).ravel()))
+            data = bytes(TEXTS.encode(np.ascontiguousarray(chunk).ravel()))
         else:
             data = chunk.astype(chunk.dtype.newbyteorder("<"), copy=False).tobytes()
         yield index, data + int(google_crc32c.value(data)).to_bytes(4, "little")
