@@ -20,7 +20,7 @@ from sobolev_batch.sources.registry import Member, digest_of
 from sobolev_batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.study.pilots import Look, choose_lattice
 from sobolev_batch.study.schema import REFERENCE_LABEL, FamilyReference
-from sobolev_batch.study.study import Members, Study
+from sobolev_batch.study.study import Study, StudyObject
 from sobolev_batch.transform.fourier import NUMERICS_VERSION, TransformSettings, require_inside
 from sobolev_batch.transform.lattice import Block, Lattice
 from sobolev_batch.transform.probe import Sample, draws_for
@@ -123,15 +123,14 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     Only the reference is loaded, and a few pilots for an accuracy. MeshError where the reference cannot be read,
     LatticeError where it does not fit into the period; see also `StudyObject.members` and `choose_lattice`.
     """
-    members = study.object.members
-    reference = _reference_label(study, members)
+    members, reference = study.object.members, _reference_label(study.object)
     try:
         own = members[reference][1].load()
     except Exception as error:  # its source may raise anything
         raise MeshError(f"the reference cannot be made: {one_line(error)}") from error
     similarity = study.object.scaling or Similarity.to_unit_ball(own)
     surface = similarity.apply(own)
-    choice, look = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
+    choice, look = _lattice_choice(study, similarity, reference, surface, earlier_choice)
     look.take_notes(reference, surface)
     require_inside(surface, choice.lattice)
     if study.proximity is not None and not isinstance(surface, Mesh):
@@ -152,15 +151,11 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
 
 
 def _lattice_choice(
-    study: Study,
-    similarity: Similarity,
-    members: Members,
-    reference: str,
-    surface: Surface,
-    earlier: LatticeChoice | None,
+    study: Study, similarity: Similarity, reference: str, surface: Surface, earlier: LatticeChoice | None
 ) -> tuple[LatticeChoice, Look]:
+    own = study.object.members[reference][1]
     if study.lattice is not None:
-        dtype, own = study.transform.dtype, members[reference][1]
+        dtype = study.transform.dtype
         tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
         compared_with = fingerprint_of(reference, own) if tail or FaceNormals.from_surfaces([surface]) else ""
         return LatticeChoice(study.lattice, dtype, dtype, tail=tail, compared_with=compared_with), Look()
@@ -172,22 +167,22 @@ def _lattice_choice(
         "orders": study.orders,
         "dtype": study.dtype,
         "similarity": [similarity.scale, *similarity.origin],
-        "reference": dict(members[reference][1].fingerprint()),
+        "reference": dict(own.fingerprint()),
     }
     basis = digest_of(made_from)
     if earlier is not None and earlier.basis == basis:
         return earlier, Look()
-    others = {label: member for label, member in members.items() if label != reference}
+    others = {label: member for label, member in study.object.members.items() if label != reference}
     choice, look = choose_lattice(study, accuracy, similarity, surface, others)
     return replace(choice, basis=basis), look
 
 
-def _reference_label(study: Study, members: Members) -> str:
-    if not isinstance(study.object.reference, FamilyReference):
+def _reference_label(one: StudyObject) -> str:
+    if not isinstance(one.reference, FamilyReference):
         return REFERENCE_LABEL
-    family, name = study.object.reference.family, study.object.reference.member
+    family, name = one.reference.family, one.reference.member
     if name is None:
-        candidates = [member for family_name, member in members.values() if family_name == family]
+        candidates = [member for family_name, member in one.members.values() if family_name == family]
         finest = max(candidates, key=lambda member: member.level)
         if sum(member.level == finest.level for member in candidates) > 1:
             raise StudyError(
@@ -195,7 +190,7 @@ def _reference_label(study: Study, members: Members) -> str:
                 + ", ".join(member.name for member in candidates[:5])
             )
         name = finest.name
-    if f"{family}/{name}" not in members:
+    if f"{family}/{name}" not in one.members:
         raise StudyError(f"reference: the family {family!r} has no member {quoted(name)}")
     return f"{family}/{name}"
 
