@@ -74,8 +74,7 @@ class Look:
             self.set_aside[label] = self.failing[label] = one_line(error)
             return None
         if (times := surface.extent.reach / reference.reach) > _FARTHEST:
-            text = f"its extent is {times:.3g} times that of the reference; are both in the same unit?"
-            self.set_aside[label] = text
+            self.set_aside[label] = f"its extent is {times:.3g} times that of the reference; are both in the same unit?"
             return None
         self.extents[label] = surface.extent
         self.take_notes(label, surface)

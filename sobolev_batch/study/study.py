@@ -334,7 +334,5 @@ def _is_taken(name: str) -> bool:
 
 def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables of a study as JSON holds them, functions by their names."""
-    written: dict[str, Any] = json.loads(
-        json.dumps(values, default=lambda value: function_name(value) if callable(value) else str(value))
-    )
-    return written
+    text = json.dumps(values, default=lambda value: function_name(value) if callable(value) else str(value))
+    return dict(json.loads(text))
