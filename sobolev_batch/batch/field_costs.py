@@ -48,7 +48,11 @@ def is_predictable(row: Row) -> bool:
 
 def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, TaskSizes], dict[str, str]]:
     """Return what the tasks of rows take, by their labels, and the reason for each row that fits into no worker."""
-    beyond = _memory_beyond(plan)
+    octaves, samples = ((), 0) if plan.tail is None else (plan.tail.octaves, plan.tail.size)
+    blocks = [plan.blocks[0], *(lattice.half for octave in octaves for lattice in octave.lattices)]
+    reference = reference_in_tasks(plan)
+    triangles = 0 if reference is None else reference.member.expected_size().triangles
+    beyond = max(blocks, key=lambda block: block.size), _SAMPLE_BYTES * samples + MESH_BYTES * triangles
 
     def sizes_for(size: ExpectedSize) -> TaskSizes:
         return size_tasks(plan.blocks, plan.transform, size, workers, len(rows), beyond)
@@ -71,15 +75,6 @@ def reference_in_tasks(plan: Plan) -> Row | None:
     return row if (plan.tail is not None or plan.choice.compared_with) and is_small else None
 
 
-def _memory_beyond(plan: Plan) -> tuple[Block, float]:
-    """Return the largest block that is transformed, and the bytes of samples in octaves and of the reference."""
-    blocks, samples = [plan.blocks[0]], 0
-    if plan.tail is not None:
-        blocks += [lattice.half for sampling in plan.tail.octaves for lattice in sampling.lattices]
-        samples = plan.tail.size
-    reference = reference_in_tasks(plan)
-    triangles = 0 if reference is None else reference.member.expected_size().triangles
-    return max(blocks, key=lambda block: block.size), _SAMPLE_BYTES * samples + MESH_BYTES * triangles
 
 
 def size_tasks(
@@ -94,8 +89,8 @@ def size_tasks(
 
     Each task holds the mesh. Its transform adds up batches of points, as large as the memory allows. Every task is kept
     within what a worker has for each of its threads, as long as that leaves a transform enough to work in; a task that
-    takes more runs beside fewer others.
-    What lies beyond the lattice is given by the largest block that is transformed, and the bytes that are held besides.
+    takes more runs beside fewer others. Beyond the lattice are the largest block that is transformed, and the bytes
+    that are held besides: samples in octaves, and the reference.
     """
     block, beyond_bytes = beyond
     block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)
