@@ -140,8 +140,7 @@ class Job:
                 "If it is, name another store, for which the lattice is chosen anew"
             )
         if isinstance(error, MemoryLimitError):
-            worker = this_worker()
-            limit = worker.memory_manager.memory_limit if worker else None
+            limit = (worker := this_worker()) and worker.memory_manager.memory_limit
             told = f" of {format_bytes(limit)}" if limit else ""
             reason = (
                 f"{reason}. That is what the limit{told} of its worker leaves; raise that limit by --worker-memory of "
@@ -184,13 +183,9 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
     try:
         # Another worker that computes them again must write the same bytes. Octaves take long enough for loops to pay.
         with compiled.by_itself(loops=job.tail is not None):
-            surface, stored = job.load(), []
+            surface = job.load()
             target = job.error_target(surface)
-            if blocks:
-                is_whole = tuple(blocks) == (job.lattice.half,)
-                stored.append(
-                    _store_whole(job, surface, target) if is_whole else _store_blocks(job, surface, blocks, target)
-                )
+            stored = [_store_blocks(job, surface, blocks, target)] if blocks else []
             if octaves and job.tail is not None:
                 stored.append(_store_octaves(job, job.tail, surface, target))
             elif blocks and blocks[0].start == job.lattice.half.start and (quality := stored[0].quality) is not None:
@@ -248,8 +243,10 @@ def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> Stor
 
 
 def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: ErrorTarget | None) -> StoredBlocks:
-    """Compute and store some of several blocks, whose settings follow from their a priori error."""
+    """Compute and store blocks; the settings of one of several follow from their a priori error."""
     lattice, execution = job.lattice, job.execution
+    if tuple(blocks) == (lattice.half,):
+        return _store_whole(job, surface, target)
     transform = choose_settings(surface, lattice, target, job.transform) if target else job.transform
     kind = transform.kind_for(surface, lattice)
     draws = draws_for([surface], lattice, job.orders, kind.lowest_degree, COMMON)

@@ -134,9 +134,8 @@ class Status(Shown):
     def _run_lines(self, run: RunRecord) -> Iterator[str]:
         start = f"by {run.driver}, begun {run.started}"
         is_ahead = self.silence_seconds < -LOST_AFTER_SECONDS
-        direction = "ahead of the clock here" if is_ahead else "ago"
         unlock = unlock_command(self.store)
-        age = f"{duration(round(abs(self.silence_seconds)))} {direction}"
+        age = f"{duration(round(abs(self.silence_seconds)))} {'ahead of the clock here' if is_ahead else 'ago'}"
         if run.state == "submitted":
             yield f"submitted {age}, no worker has taken it up yet; {start}"
             if self.lost:
