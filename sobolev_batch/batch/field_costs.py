@@ -75,8 +75,6 @@ def reference_in_tasks(plan: Plan) -> Row | None:
     return row if (plan.tail is not None or plan.choice.compared_with) and is_small else None
 
 
-
-
 def size_tasks(
     blocks: Sequence[Block],
     transform: TransformSettings,

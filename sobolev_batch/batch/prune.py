@@ -9,7 +9,6 @@ from sobolev_batch.store.layout import FIELD, OCTAVES, QUALITY, TAGS, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
 from sobolev_batch.store.objects import Objects, lost_objects, root_of
-from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import Contents
 
 _LOST, _KILLED, _UNLISTED = (
@@ -60,10 +59,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
                 prefixes.add(group)
         if not is_dry:
             # Records go first: one without its field would be damage.
-            for row in lost:
-                if contents.records[row] is not None:
-                    Records(store).write(row, None)
-                    contents.records[row] = None
+            contents.withdraw(row for row in lost if contents.records[row] is not None)
             if lost:
                 store.write(QUALITY, [0], contents.qualities)
             location.remove_partial_files()

@@ -12,7 +12,7 @@ from zarr.buffer.cpu import NDBuffer
 
 from sobolev_batch.arrays import slices
 from sobolev_batch.errors import DamageError
-from sobolev_batch.store.checked import checksum_of
+from sobolev_batch.store.checked import CHANGED, checksum_of
 from sobolev_batch.store.layout import FIELD, OCTAVES, Store
 from sobolev_batch.store.metadata import chunk_shape
 from sobolev_batch.store.records import Record
@@ -49,8 +49,7 @@ class Fields:
         name = FIELD if len(place) == len(AXES) else OCTAVES
         document = self.store.document(name)
         values = np.ascontiguousarray(values, dtype=document["data_type"])
-        steps = chunk_shape(document)[1:]
-        index = [row, *(axis.start // step for axis, step in zip(place, steps, strict=True))]
+        index = [row, *(axis.start // step for axis, step in zip(place, chunk_shape(document)[1:], strict=True))]
         self.store.write(name, index, values[None])
         return checksum_of(values)
 
@@ -74,9 +73,8 @@ class Fields:
                 except damage as error:
                     raise _damage(store, rows[i], str(error)) from error
             if checksums is not None and checksum_of(values[i]) != checksums[i]:
-                lost = bool(np.isnan(values[i]).all())
-                problem = "it is not there" if lost else "it is not what was written for its record"
-                raise _damage(store, rows[i], problem)
+                others = f"{CHANGED} for its record"
+                raise _damage(store, rows[i], "it is not there" if np.isnan(values[i]).all() else others)
 
         # Most of the time of a request is spent waiting.
         with ThreadPoolExecutor(max(1, len(rows)) if store.location.scheme else 1) as pool:
@@ -99,8 +97,7 @@ class Fields:
         """Return the rows whose blocks all exist in their full length. No block is read."""
         rows = set(range(self.store.row_count))
         for name in self.store.documents.keys() & {FIELD, OCTAVES}:
-            incomplete = self.store.incomplete_chunks(name, self.store.location.sizes(f"{name}/c"))
-            rows -= {index[0] for index in incomplete}
+            rows -= {place[0] for place in self.store.incomplete_chunks(name, self.store.location.sizes(f"{name}/c"))}
         return rows
 
 

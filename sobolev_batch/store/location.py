@@ -343,8 +343,7 @@ class FolderStore(LocalStore):
         for file in _files_below(path_in(self.root, prefix)):
             with suppress(FileNotFoundError):  # It was removed since.
                 is_file = file.is_file(follow_symlinks=False)
-                size = file.stat(follow_symlinks=False).st_size if is_file else 0
-                sizes[file.path[root:]] = size
+                sizes[file.path[root:]] = file.stat(follow_symlinks=False).st_size if is_file else 0
         return sizes
 
 

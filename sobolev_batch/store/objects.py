@@ -81,8 +81,7 @@ class Objects:
                 raise DamageError(f"{store.path}: {problem}; run the study again", problem)
             return None
         if study != f"{self.name} {name}":
-            problem = f"it holds the study {study!r}, not that of the object {name!r}"
-            problem += "; put the store of this object back, or remove it"
+            problem = f"it holds the study {study!r}, not that of the object {name!r}; put that back, or remove this"
             raise DamageError(f"{store.path}: {problem}", problem)
         return store.location
 

@@ -124,11 +124,9 @@ class _Line:
             table = dict(json.loads(text))
         except (ValueError, TypeError, RecursionError) as error:
             raise damaged_record(name, f"no table: {error}", text) from error
-        stored_row = table.pop(_ROW, None)
-        record = record_in(cls, table, name)
-        if stored_row != row:
+        if (stored_row := table.pop(_ROW, None)) != row:
             raise damaged_record(name, f"it is that of row {stored_row!r}", text)
-        return record
+        return record_in(cls, table, name)
 
 
 @dataclass(frozen=True)
@@ -248,8 +246,9 @@ class Records(Generic[RecordType]):
         records, damage = self.examine()
         names = self.store.names_of_rows(len(records)) if damage else ()
         for row, what in damage.items():
-            name = f"{self.store.path}: the record of {names[row]}"
-            _log.warning("%s is damaged and counts as not there: %s", name, what)
+            _log.warning(
+                "%s: the record of %s is damaged and counts as not there: %s", self.store.path, names[row], what
+            )
         return tuple(records)
 
     def read_one(self, row: int, *, of_this_run: bool = False) -> RecordType | None:

@@ -56,9 +56,8 @@ def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[s
     sealed = np.asarray(store.read(keys, _region(store, keys, index)))
     arrays = {name: np.asarray(store.read(name, _region(store, name, index))) for name in arrays_of(store, keys)}
     # A single key is for the whole of a chunk, others are for its rows.
-    is_for_rows = sealed.ndim == 1
     for number, text in enumerate(sealed.ravel().tolist()):
-        own = [values[number] if is_for_rows else values for values in arrays.values()]
+        own = [values[number] if sealed.ndim == 1 else values for values in arrays.values()]
         if text and text != seal(key_in(text), own):
             raise store.damage(f"chunk {index} of {keys.split('/')[0]}", CHANGED)
     return [key_in(text) for text in sealed.ravel().tolist()], arrays
@@ -81,6 +80,5 @@ def withdraw_chunk(store: Store, keys: str, index: Index) -> None:
 
 def _region(store: Store, name: str, index: Index) -> tuple[slice, ...]:
     """Return the place of an array's chunk along the axes of its keys."""
-    document = store.document(name)
-    axes = zip(index, chunk_shape(document), document["shape"], strict=False)
-    return tuple(slice(step * number, min(step * (number + 1), length)) for number, step, length in axes)
+    axes = zip(index, chunk_shape(store.document(name)), strict=False)
+    return tuple(slice(step * number, step * (number + 1)) for number, step in axes)

@@ -68,6 +68,14 @@ class Contents:
         measured = {self.labels[i]: record.proximity for i, record in self.complete.items()}
         return {label: f"no proximity: {one.reason}" for label, one in measured.items() if one and one.reason}
 
+    def withdraw(self, rows: Iterable[int], damage: str = "") -> None:
+        """Withdraw the records of rows, whose fields may be damaged: a run computes those again."""
+        for i in rows:
+            if damage:
+                _log.warning("the field of %s is damaged (%s) and is computed again", self.labels[i], damage)
+            Records(self.store).write(i, None)
+            self.records[i] = None
+
     def tally(self, imprecise: Mapping[str, float] | None = None) -> ObjectRecord:
         """Return what the store has and lacks, as the record of its object.
 
@@ -186,16 +194,6 @@ class Workspace(Contents):
         Records(self.store).collect(self.records)
         self.store.remember()
 
-    def withdraw(self, rows: Iterable[int], reason: str) -> None:
-        """Withdraw the records of damaged fields, which makes them pending."""
-        for i in rows:
-            _log.warning("the field of %s is damaged (%s) and is computed again", self.rows[i].label, reason)
-            self._withdraw(i)
-
-    def _withdraw(self, row: int) -> None:
-        Records(self.store).write(row, None)
-        self.records[row] = None
-
     def withdraw_results_of(self, rows: Sequence[int]) -> None:
         """Withdraw the tables and qualities that follow from fields which are about to be replaced.
 
@@ -206,8 +204,7 @@ class Workspace(Contents):
             hide_tables(self.store)
             qualities = ["" if i in replaced else quality for i, quality in enumerate(self.qualities)]
             self.store.write(QUALITY, [0], qualities)
-        for i in others:
-            self._withdraw(i)
+        self.withdraw(others)
 
 
 def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:
