@@ -237,11 +237,8 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     yield "orders", ", ".join(f"{order:g}" for order in study.orders)
     if tail is not None:
         shortest = 1 / (tail.highest_frequency * similarity.scale)
-        yield (
-            "octaves",
-            f"{len(tail.octaves)} beyond the lattice, to |xi| {tail.highest_frequency:.4g}: wavelengths down to "
-            f"{shortest:.3g} of the files' unit; {tail.size:,} samples",
-        )
+        reach = f"to |xi| {tail.highest_frequency:.4g}: wavelengths down to {shortest:.3g} of the files' unit"
+        yield "octaves", f"{len(tail.octaves)} beyond the lattice, {reach}; {tail.size:,} samples"
         yield "", f"{format_bytes(tail.size * plan.item_bytes)} per surface"
     accuracy, transform = study.accuracy, plan.transform
     if accuracy is None:
@@ -337,15 +334,13 @@ def plan(
         return _plan(one, place, workers, client, bases)
 
     plans, refused = for_each_object(part, location, planned)
-    seconds, processor_seconds, time = _forecast(plans.values(), weight, workers, client is None, bases)
+    seconds, work, time = _forecast(plans.values(), weight, workers, client is None, bases)
     if refused:
         few = f"{len(refused):,} of {len(plans) + len(refused):,} objects cannot be planned, for the reasons below"
         time = (*(time if plans else ()), few)
-    lacking = "" if store is None else location.lacks_folder()
-    warnings, count = tuple(filter(None, [lacking])), len(study.objects)
-    return StudyPlan(
-        study.name, str(location), count, weight, plans, refused, seconds, processor_seconds, time, warnings
-    )
+    lacking, count = "" if store is None else location.lacks_folder(), len(study.objects)
+    warnings = (lacking,) if lacking else ()
+    return StudyPlan(study.name, str(location), count, weight, plans, refused, seconds, work, time, warnings)
 
 
 def _looked_at(study: Study, location: Location) -> tuple[list[str], float]:
@@ -403,6 +398,7 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
     seconds, basis = seconds_of_missing(plan, stored, workers, client)
     bases.update(filter(None, [basis]))
     (failing, doubtful), gpus = _doubts_of(plan, stored), sum(one.backend == "gpu" for one in workers.members)
+    capacity = f"for tasks, {format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread"
     return ObjectPlan(
         store=str(location),
         labels=tuple(row.label for row in plan.rows),
@@ -428,11 +424,7 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
             *reasons("failing", failing),
             *reasons("doubtful", doubtful),
             *_study_lines(plan),
-            (
-                "workers",
-                f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; for tasks, "
-                f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread",
-            ),
+            ("workers", f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; {capacity}"),
         ),
     )
 
