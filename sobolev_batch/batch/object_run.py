@@ -118,14 +118,11 @@ def has_rows_of_now(one: StudyObject, record: ObjectRecord | None) -> bool:
     return bool(settings) and settings.items() <= {"proximity": None, **_settings_of(one)}.items()
 
 
-def object_key(one: StudyObject, members: Members, fingerprints: Mapping[str, str]) -> str:
+def object_key(one: StudyObject, members: Members, prints: Mapping[str, str]) -> str:
     """Return a digest of all that the tables of an object depend on; empty where a file of it cannot be read."""
-    if not all(fingerprints.values()):
+    if not all(prints.values()):
         return ""
-    surfaces = [
-        [label, family, member.time, member.metadata, fingerprints[label]]
-        for label, (family, member) in members.items()
-    ]
+    surfaces = [[label, family, mesh.time, mesh.metadata, prints[label]] for label, (family, mesh) in members.items()]
     return digest_of([*_VERSIONS, one.table, surfaces])
 
 

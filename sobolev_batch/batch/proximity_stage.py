@@ -169,10 +169,8 @@ def _current(workspace: Workspace) -> list[tuple[str, ProximityRecord | None]]:
 def _dataset(workspace: Workspace, requested: ProximitySection) -> xr.Dataset:
     """Return the numbers of `proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
     labels, records = zip(*_current(workspace), strict=True)
-    columns: dict[str, Any] = {
-        name: [record.numbers.get(name, np.nan) if record else np.nan for record in records]
-        for name in proximity.NUMBERS
-    }
+    measured = [record.numbers if record else {} for record in records]
+    columns: dict[str, Any] = {name: [one.get(name, np.nan) for one in measured] for name in proximity.NUMBERS}
     columns["reason"] = np.array([record.reason if record else "" for record in records], dtype=object)
     attributes = {
         "reference": workspace.plan.reference,

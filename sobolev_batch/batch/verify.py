@@ -73,11 +73,9 @@ class Verification(Shown):
             lines.append(f"{name}: {counts if one.total else nothing}")
         damage = {**self.fields, **{f"table {name}": what for name, what in self.tables.items()}}
         lines += [f"{name}: {what}" for name, what in damage.items()]
-        remedy = (
-            "run the study again to repair it"
-            if self.withdrawn
-            else "the store cannot be written from here, so nothing was withdrawn"
-        )
+        remedy = "run the study again to repair it"
+        if not self.withdrawn:
+            remedy = "the store cannot be written from here, so nothing was withdrawn"
         surfaces = f"{len(self.fields)} surface{'s' * (len(self.fields) != 1)}"
         arrays = f"{len(self.tables)} array{'s' * (len(self.tables) != 1)} of tables"
         found = f"damaged: {surfaces} and {arrays}; {remedy}"

@@ -259,10 +259,7 @@ class Store:
         if problems:
             # A run makes them from the fields.
             self.lacks_tables = True
-            _log.warning(
-                "%s: its tables are not used: %s; this program did not write that, and run makes them again",
-                *(self.path, problems[0][1]),
-            )
+            _log.warning("%s: its tables are not used: %s; run makes them again", self.path, problems[0][1])
             nodes = document["consolidated_metadata"]["metadata"]
             document["consolidated_metadata"]["metadata"] = {n: d for n, d in nodes.items() if not _is_of_tables(n)}
         return document

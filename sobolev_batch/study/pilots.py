@@ -139,11 +139,10 @@ def choose_lattice(
     for label, reason in look.set_aside.items():
         _log.warning("the lattice is chosen without %s: %s", label, reason)
     if not pilots:
-        examples = [f"{label}: {reason}" for label, reason in look.set_aside.items()]
+        why = next((f" ({label}: {reason})" for label, reason in look.set_aside.items()), ", since all are too large")
         raise StudyError(
-            "none of the study's surfaces can serve to choose a lattice"
-            + (f" ({examples[0]})" if examples else ", since all are too large")
-            + "; mend what is wrong with them. If they are sound, give a [lattice] instead of an [accuracy]"
+            f"none of the study's surfaces can serve to choose a lattice{why}; mend what is wrong with them. If they "
+            "are sound, give a [lattice] instead of an [accuracy]"
         )
     extent = Extent.union([reference.extent, *look.extents.values()])
     widths, reach = _REACH_MARGIN * extent.widths, _REACH_MARGIN * extent.reach
