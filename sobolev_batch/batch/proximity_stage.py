@@ -130,10 +130,7 @@ def _load(row: Row, digest: str, similarity: Similarity) -> Mesh:
     """Load the mesh of a row in the study's unit, where it is still the one whose field is stored."""
     surface = similarity.apply(row.member.load())
     if not isinstance(surface, Mesh) or surface.digest != digest:
-        raise MeshError(
-            f"what is made of {row.label} now is not the mesh whose field is stored; a file may have changed: run the "
-            "study again"
-        )
+        raise MeshError(f"{row.label} is not the mesh whose field is stored; has a file changed? Run the study again")
     return surface
 
 

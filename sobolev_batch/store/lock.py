@@ -155,8 +155,7 @@ def acquire(location: Location, lock: Lock) -> None:
 def _take_over(location: Location, lock: Lock, current: Lock) -> None:
     refusal = LockError(
         f"{location}: another run has this store to itself: {current.driver}, since {current.since}. "
-        "Wait for it or stop it; if it is gone without having been able to say so, "
-        f"unlock the store with: {unlock_command(str(location))}"
+        f"Wait for it or stop it; if it is gone, unlock the store with: {unlock_command(str(location))}"
     )
     if not current.holder_is_gone or not location.create(_TAKEOVER_KEY, lock.to_json()):
         raise refusal

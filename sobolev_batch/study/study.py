@@ -80,10 +80,7 @@ class StudyObject:
             raise StudyError("[reference] must be a table, found None")
         if same := duplicate_names(names):
             twice = ", ".join(quoted(name) for group in same[:3] for name in group[:3])
-            raise StudyError(
-                "family: names must differ by more than case and the spelling of accents, "
-                f"found {twice} twice; rename one"
-            )
+            raise StudyError(f"family: names must differ by more than case and accents, found {twice}; rename one")
         if any(caseless_key(name) == REFERENCE_LABEL for name in names):
             raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
         if isinstance(reference, FamilyReference) and reference.family not in names:

@@ -164,10 +164,7 @@ def check_cluster(client: Client | None, workers: object, memory: object = None)
 def require_blocking(client: Client) -> None:
     """Refuse by an InputError what is no client, and an asynchronous one, whose answers would have to be awaited."""
     if not isinstance(client, Client):
-        raise InputError(
-            f"client must be a dask.distributed.Client, found {client!r}; for the address of a scheduler, give "
-            "Client(address)"
-        )
+        raise InputError(f"client must be a dask.distributed.Client, found {client!r}; give Client(address)")
     if client.asynchronous:
         raise InputError(
             "the client is asynchronous, and studies wait for its answers; give a Client without asynchronous=True, "
