@@ -108,4 +108,4 @@ def _field_task(job: Job, groups: BlockGroups, projected_bytes: float) -> Task:
     parts = [(blocks, False) for blocks in groups] + [((), True)] * (job.tail is not None)
     label, stage = job.planned.label, "part of field"
     tasks = [Task(compute_parts, (job, *part), projected_bytes, needs_gpu, label=label, stage=stage) for part in parts]
-    return Task(finish_mesh, (job, tasks), row=job.row, label=label, stage="field")
+    return Task(finish_mesh, (job, *tasks), row=job.row, label=label, stage="field")

@@ -197,7 +197,7 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
     return [replace(stored[0], seconds=time.perf_counter() - started), *stored[1:]]
 
 
-def finish_mesh(job: Job, parts: Sequence[list[StoredBlocks] | Record]) -> Record:
+def finish_mesh(job: Job, *parts: list[StoredBlocks] | Record) -> Record:
     """Write the completion record of a mesh whose blocks are all stored, or that failed, unless it exists."""
     record = next((part for part in parts if isinstance(part, Record)), None) or job.stored_record()
     return record or _finished(job, [stored for part in parts if isinstance(part, list) for stored in part])

@@ -124,7 +124,7 @@ def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypat
     blocks = plan.blocks
     job = job_of(plan, store_path, "ico/1")
     parts = [*(compute_parts(job, [block]) for block in blocks), compute_parts(job, octaves=True)]
-    record = finish_mesh(job, parts)
+    record = finish_mesh(job, *parts)
     assert (record.status, len(record.checksums)) == ("complete", len(blocks) + 1)
 
     def refuse(*arguments: Any) -> None:
@@ -135,7 +135,7 @@ def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypat
     again = [*(compute_parts(job, [block]) for block in blocks), compute_parts(job, octaves=True)]
     # Those whose worker was lost are done again; the results of others may be there still.
     for mixture in (parts, again, [*parts[:2], *again[2:]]):
-        assert finish_mesh(job, mixture) == record
+        assert finish_mesh(job, *mixture) == record
     assert compute_mesh(job, blocks) == record
 
 

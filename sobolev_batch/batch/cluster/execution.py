@@ -72,7 +72,7 @@ class Task:
     """A call of a function on a worker.
 
     Attributes:
-        arguments: Arguments of the call. Results take the place of tasks among them, also within a list.
+        arguments: Arguments of the call. Results take the place of tasks among them.
         projected_bytes: Memory that the call takes at most.
         needs_gpu: True where the call has to run on a worker with a GPU.
         row: Row of the store that the task works for, for the caller.
@@ -125,17 +125,12 @@ class Cluster:
 
     def submit(self, task: Task, claims_memory: bool) -> Future:
         """Submit a task after those among its arguments."""
-
-        def submitted(argument: Any) -> Any:
-            if isinstance(argument, list):
-                return [submitted(item) for item in argument]
-            return self.submit(argument, claims_memory) if isinstance(argument, Task) else argument
-
+        arguments = (self.submit(one, claims_memory) if isinstance(one, Task) else one for one in task.arguments)
         resources = {MEMORY: task.projected_bytes} if claims_memory and task.projected_bytes else {}
         if task.needs_gpu:
             resources[GPU] = 1.0
         key = task_key(task.stage or task.function.__name__, self.study, self.part, task.label)
-        return self.client.submit(task.function, *map(submitted, task.arguments), key=key, resources=resources or None)
+        return self.client.submit(task.function, *arguments, key=key, resources=resources or None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,10 +190,8 @@ def in_place(stages: Stages[Result]) -> Result:
 def outcomes_here(tasks: Sequence[Task]) -> list[Any]:
     """Do tasks one after the other, and return the result of each, or its exception; a StoreError ends it."""
 
-    def done(argument: Any) -> Any:
-        if isinstance(argument, list):
-            return [done(one) for one in argument]
-        return argument.function(*map(done, argument.arguments)) if isinstance(argument, Task) else argument
+    def done(task: Task) -> Any:
+        return task.function(*(done(one) if isinstance(one, Task) else one for one in task.arguments))
 
     outcomes = []
     for task in tasks:

@@ -72,12 +72,12 @@ def few_at_a_time(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     monkeypatch.setattr(execution, "_IN_FLIGHT_PER_THREAD", 0)
 
 
-def _total(number: int, others: list[int]) -> int:
-    return number + sum(others)
+def _total(*numbers: int) -> int:
+    return sum(numbers)
 
 
 def test_the_results_of_tasks_are_arguments_of_others(cluster: Cluster) -> None:
-    ((_, total),) = outcomes_of(cluster, [Task(_total, (Task(abs, (-3,)), [Task(abs, (-4,)), 5]))])
+    ((_, total),) = outcomes_of(cluster, [Task(_total, (Task(abs, (-3,)), Task(abs, (-4,)), 5))])
     assert total == 3 + 4 + 5
 
 
@@ -172,7 +172,7 @@ def test_a_run_in_place_is_the_same(cluster: Cluster) -> None:
     seen: list[Any] = []
 
     def stages() -> Stages[str]:
-        tasks = [Task(abs, (-1,)), Task(sum, ([Task(abs, (-2,)), 3],)), Task(_fail, (ValueError("bad mesh"),))]
+        tasks = [Task(abs, (-1,)), Task(_total, (Task(abs, (-2,)), 3)), Task(_fail, (ValueError("bad mesh"),))]
         yield Wave(cluster, tasks, lambda task, outcome: seen.append(outcome))
         try:
             yield Wave(cluster, [Task(_fail, (StoreError("disk full"),)), Task(abs, (-9,))], ignore)
