@@ -218,7 +218,7 @@ class Records(Generic[RecordType]):
         """Return the completion record of each row, None if it has none that can be read, and the damage of those."""
         records: list[RecordType | None] = [None] * self.store.document(RECORD)["shape"][0]
         own = [row for row in self.store.stored_chunks(RECORD) if row < len(records)]
-        lines, damage = self._lines(PAGE, range(len(records)), self._rows_per_page) | self._lines(RECORD, own, 1), {}
+        lines, damage = self._lines(PAGE, range(len(records))) | self._lines(RECORD, own), {}
         for row, line in lines.items():
             try:
                 if isinstance(line, DamageError):
@@ -228,10 +228,11 @@ class Records(Generic[RecordType]):
                 damage[row] = error.what
         return records, damage
 
-    def _lines(self, name: str, rows: Sequence[int], step: int) -> dict[int, str | DamageError]:
-        """Return the texts of rows, which begin with a chunk of this length, or the damage of their chunk."""
+    def _lines(self, name: str, rows: Sequence[int]) -> dict[int, str | DamageError]:
+        """Return the texts of rows, which begin with a chunk, or the damage of their chunk."""
         if not rows:
             return {}
+        (step,) = chunk_shape(self.store.document(name))
         try:
             return dict(zip(rows, map(str, self.store.read(name, list(rows)).tolist()), strict=True))
         except DamageError as error:
@@ -239,7 +240,7 @@ class Records(Generic[RecordType]):
                 return dict.fromkeys(rows, error)
         # Each chunk is read by itself to see which.
         parts = (rows[start : start + step] for start in range(0, len(rows), step))
-        return {row: line for part in parts for row, line in self._lines(name, part, step).items()}
+        return {row: line for part in parts for row, line in self._lines(name, part).items()}
 
     def read(self) -> tuple[RecordType | None, ...]:
         """Return the completion record of each row, or None if it has none that can be read."""
@@ -272,7 +273,7 @@ class Records(Generic[RecordType]):
         Returns:
             Rows that keep their own chunks, as these are.
         """
-        step, kept = self._rows_per_page, list[int]()
+        (step,), kept = chunk_shape(self.store.document(PAGE)), list[int]()
         most_bytes = largest_chunk_bytes(self.store.document(PAGE))
         for page, stored in groupby(self.store.stored_chunks(RECORD), key=lambda row: row // step):
             start, own = page * step, list(stored)
@@ -286,8 +287,3 @@ class Records(Generic[RecordType]):
             else:
                 kept += own
         return kept
-
-    @property
-    def _rows_per_page(self) -> int:
-        """Number of rows of a page; the last page may have fewer."""
-        return chunk_shape(self.store.document(PAGE))[0]

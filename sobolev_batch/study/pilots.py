@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -99,16 +100,14 @@ class Look:
 
 def choose_pilots(members: Members, similarity: Similarity, reference: Extent, look: Look) -> dict[str, Surface]:
     """Return the coarsest and the finest surface of a few families, by label."""
-    families: dict[str, list[str]] = {}
-    for label, (family, _) in members.items():
-        families.setdefault(family, []).append(label)
+    families = [list(labels) for _, labels in groupby(members, key=lambda label: members[label][0])]
 
     def fineness(label: str) -> tuple[int, int]:
         _, member = members[label]
         return member.level, 0 if member.level >= 0 else member.expected_size().triangles
 
     pilots: dict[str, Surface] = {}
-    for labels in list(families.values())[:_MOST_FAMILIES]:
+    for labels in families[:_MOST_FAMILIES]:
         labels.sort(key=fineness)
         for candidates in (labels, labels[::-1]):
             for label in candidates:
