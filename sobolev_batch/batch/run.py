@@ -157,7 +157,7 @@ def run(
             try:
                 return carry_out(study, location, lock, equip, notify)
             except SobolevBatchError:
-                give_up(lock.of_run(location))
+                give_up(lock.fenced(location))
                 raise
 
 
@@ -172,7 +172,7 @@ def carry_out(
 
     What ends the run of an only object without a name is raised, and what ends those of all objects.
     """
-    place, numbers = lock.of_run(location), {name: n for n, name in enumerate(study.objects, 1)}
+    place, numbers = lock.fenced(location), {name: n for n, name in enumerate(study.objects, 1)}
     equip, at_hand = cache(equip), None
     objects = None if "" in study.objects else Objects.prepared(place, study)
     if objects is None and (at_hand := object_run.workspace_at_hand(study, place)) is None:

@@ -86,7 +86,7 @@ def submit(
             workers = prepare_workers(client, study.libraries)
         workers.with_backend(study.backend)
         workers.require_accuracy(study.accuracy)
-        submission = _prepared(study, lock.of_run(location))
+        submission = _prepared(study, lock.fenced(location))
         heartbeat = Heartbeat(location, lock, watch)
         heartbeat.write("submitted")
         # The worker was started in another folder.

@@ -119,7 +119,7 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
         return _verify_all(location, objects, notify, may_write=False)
     try:
         # It is opened again: the last run may have ended since. Whoever unlocks it may change it.
-        own = replace(location, fence=lock.of_holder(root).fence)
+        own = replace(location, fence=lock.fenced(root, "holder").fence)
         objects = objects and Objects.read(own, is_thorough=True)
         found = _verify_all(own, objects, notify, may_write=True)
         # A damaged root loses all records when a run makes it again.

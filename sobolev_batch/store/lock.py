@@ -107,13 +107,9 @@ class Lock:
         current = Lock.read(location)
         return current is not None and current.holder == self.holder
 
-    def of_run(self, location: Location) -> Location:
-        """Return a location for tasks: it may be written, with all below, as long as the lock's run has it."""
-        return replace(location, fence=partial(self._require, location, "run"))
-
-    def of_holder(self, location: Location) -> Location:
-        """Return a location for the process that has the lock, in whose place another one may come."""
-        return replace(location, fence=partial(self._require, location, "holder"))
+    def fenced(self, location: Location, by: Literal["run", "holder"] = "run") -> Location:
+        """Return a location that may be written, with all below, as long as the lock's run, or its holder, has it."""
+        return replace(location, fence=partial(self._require, location, by))
 
     def _require(self, location: Location, part: Literal["run", "holder"]) -> None:
         current = Lock.read(location)

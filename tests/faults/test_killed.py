@@ -340,14 +340,14 @@ def test_a_worker_that_goes_on_after_another_run_writes_nothing(
 
 def test_only_the_run_that_has_the_store_writes(store_path: Path, finished_store: Path) -> None:
     location, lock = Location(str(finished_store)), Lock.of_this_process()
-    store = Store(lock.of_run(location))
+    store = Store(lock.fenced(location))
     record = Records(store).read_one(0)
     with pytest.raises(LockError, match="the store was unlocked, or its run is over"):
         Records(store).write(0, record)
     with locked(location, lock):
         Records(store).write(0, record)
         with pytest.raises(LockError, match=r"no longer has the store: process \d+ on .* has it now"):
-            Records(Store(Lock.of_this_process().of_run(location))).write(0, record)
+            Records(Store(Lock.of_this_process().fenced(location))).write(0, record)
     assert json.loads(record.to_json(0) if record else "{}")["row"] == 0
 
 

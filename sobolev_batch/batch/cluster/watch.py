@@ -174,7 +174,7 @@ class Heartbeat:
     def __init__(self, location: Location, lock: Lock, watch: Watch | None = None) -> None:
         self.stage, self.watch = "", watch
         # Another driver of the same run may take its lock over, as when this one's worker was retired.
-        self._store = Store(lock.of_holder(location))
+        self._store = Store(lock.fenced(location, "holder"))
         self._lost: LockError | None = None
         self._started = utc_now()
 
