@@ -54,20 +54,6 @@ class Contents:
         """Quality of each row's field, of which readers find a copy beside the fields; empty without a field."""
         return [record.quality if record else "" for record in self.records]
 
-    @property
-    def failed(self) -> dict[str, str]:
-        """Reason of each row whose field could not be computed, by its label."""
-        found = {self.labels[i]: self.records[i] for i in self.rows}
-        return {label: record.reason for label, record in found.items() if record and record.status == "failed"}
-
-    @property
-    def not_compared(self) -> dict[str, str]:
-        """Reason of each row whose Hausdorff and Chamfer distances could not be measured, where the study asks."""
-        if self.store.attributes()["study"]["table"].get("proximity") is None:
-            return {}
-        measured = {self.labels[i]: record.proximity for i, record in self.complete.items()}
-        return {label: f"no proximity: {one.reason}" for label, one in measured.items() if one and one.reason}
-
     def withdraw(self, rows: Iterable[int], damage: str = "") -> None:
         """Withdraw the records of rows, whose fields may be damaged: a run computes those again."""
         for i in rows:
@@ -81,11 +67,14 @@ class Contents:
 
         A run that has just written the tables knows which distances are imprecise, and that no record was lost since.
         """
+        complete, found = self.complete, ((self.labels[i], self.records[i]) for i in self.rows)
+        is_compared = self.store.attributes()["study"]["table"].get("proximity") is not None
+        measured = ((self.labels[i], record.proximity) for i, record in complete.items() if is_compared)
         return ObjectRecord(
-            complete=len(self.complete),
+            complete=len(complete),
             total=len(self.rows),
-            failed=self.failed,
-            not_compared=self.not_compared,
+            failed={label: one.reason for label, one in found if one and one.status == "failed"},
+            not_compared={label: f"no proximity: {one.reason}" for label, one in measured if one and one.reason},
             imprecise=imprecise or {},
             lost_records=tuple(self.labels[row] for row in self.unlike_tables) if imprecise is None else (),
             has_tables=self.has_tables,
