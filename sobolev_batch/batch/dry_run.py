@@ -48,8 +48,7 @@ def seconds_of_missing(
 ) -> tuple[dict[str, float], str]:
     """Predict the processor seconds of each surface that is missing, by label; return also what tells the speed."""
     predicted = {row.label: row_seconds(plan, row) for row in plan.rows}
-    missing = [label for label in predicted if label not in stored]
-    if not missing:
+    if not (missing := [label for label in predicted if label not in stored]):
         return {}, ""
     # What programs took is in the time of others, and in no prediction.
     known = [row.label for row in plan.rows if row.label in stored and is_predictable(row)]
@@ -345,8 +344,7 @@ def plan(
 
 def _looked_at(study: Study, location: Location) -> tuple[list[str], float]:
     """Return the names of the objects to plan, and how many unfinished ones each of them stands for."""
-    names = list(study.objects)
-    if len(names) <= _MOST_OBJECTS:
+    if len(names := list(study.objects)) <= _MOST_OBJECTS:
         return names, 1.0
     objects = Objects.read(location)
     recorded = {} if objects is None else objects.recorded()
@@ -362,8 +360,7 @@ def _forecast(
 
     Objects are carried out beside each other, and each stands for some.
     """
-    missing = round(weight * sum(len(one.task_seconds) for one in objects))
-    if not missing:
+    if not (missing := round(weight * sum(len(one.task_seconds) for one in objects))):
         lacks_tables = any(one.lacks_tables for one in objects)
         text = "no field is missing, and tables follow from them" if lacks_tables else "nothing is missing"
         return 0.0, 0.0, (text,)

@@ -251,8 +251,7 @@ def lacks_nothing(workspace: Workspace) -> bool:
 
 def _rows_of_all(workspace: Workspace, tables: Tables | None) -> bytes | None:
     """Return the rows of an object in the tables of all objects; None for an only one, whose tables are at the root."""
-    study = workspace.plan.study
-    if not study.object.name:
+    if not (study := workspace.plan.study).object.name:
         return None
     if tables is None or study.proximity is not None:
         tables = tables_in(workspace.store)

@@ -203,8 +203,7 @@ def status(store: AnyStore) -> Status:
     done; by process ...
     """
     location = Location.parse(location_of(store))
-    objects = Objects.read(location)
-    if objects is not None:
+    if (objects := Objects.read(location)) is not None:
         run = RunRecord.read(objects.records.store)
         tallies = dict(_tallies(objects))
         moments = [one.finished for one in tallies.values() for _ in range(one.complete)]

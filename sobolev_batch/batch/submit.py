@@ -124,8 +124,7 @@ def drive(study: Study, store: str, run: str) -> None:
     location = Location.parse(store)
     lock = Lock.of_this_process(run, outlives_process=True)
     try:
-        present = Lock.read(location)
-        if present is None or present.run != run:
+        if (present := Lock.read(location)) is None or present.run != run:
             _log.warning("%s: the store was unlocked since the study was submitted, or is done; left alone", store)
             return
         acquire(location, lock)

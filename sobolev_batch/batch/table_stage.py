@@ -97,8 +97,7 @@ def write_results(
 
 def _pairs(workspace: Workspace) -> Pairs | None:
     """Return the distances of all pairs, if the study requests them: of the meshes in the order of their rows."""
-    study = workspace.plan.study
-    if study.pairs != "all":
+    if (study := workspace.plan.study).pairs != "all":
         return None
     rows = tuple(sorted(workspace.rows))
     return Pairs(workspace.store, rows, _record_keys(workspace), study.orders, workspace.reference)

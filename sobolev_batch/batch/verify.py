@@ -106,8 +106,7 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     """
     location, notify = Location.parse(store), callback(on_progress)
     root, lock = root_of(location), Lock.of_this_process()
-    objects = Objects.read(location, is_thorough=True)
-    if objects is None:
+    if (objects := Objects.read(location, is_thorough=True)) is None:
         # Where there is no store, this says so.
         Store.open(location)
     try:

@@ -83,8 +83,7 @@ class Fields:
 
     def damage(self, row: int, record: Record) -> str:
         """Read the field of a row, and return how it differs from its record; empty if it does not."""
-        places = self.places()
-        if len(record.checksums) != len(places):
+        if len(record.checksums) != len(places := self.places()):
             return f"its record knows of {len(record.checksums)} blocks, and the store has {len(places)}"
         try:
             for place, checksum in zip(places, record.checksums, strict=True):

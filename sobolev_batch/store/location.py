@@ -111,16 +111,14 @@ class Location:
     def read(self, key: str, most_bytes: int | None = None) -> bytes | None:
         """Return the bytes of a key, or None if it does not exist."""
         with self.access("read"):
-            store = self.zarr_store()
-            if isinstance(store, FolderStore):
+            if isinstance(store := self.zarr_store(), FolderStore):
                 return store.content(key, most_bytes)
             content = sync(store.get(key, default_buffer_prototype()))
             return None if content is None else content.to_bytes()
 
     def write(self, documents: Mapping[str, bytes]) -> None:
         """Write small documents by their keys, in any order. Each is replaced as a whole."""
-        store = self.zarr_store()
-        if isinstance(store, FolderStore):
+        if isinstance(store := self.zarr_store(), FolderStore):
             with self.access("written"):
                 for key, document in documents.items():
                     store.put(key, document)

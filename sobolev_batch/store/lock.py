@@ -112,8 +112,7 @@ class Lock:
         return replace(location, fence=partial(self._require, location, by))
 
     def _require(self, location: Location, part: Literal["run", "holder"]) -> None:
-        current = Lock.read(location)
-        if current is None or getattr(current, part) != getattr(self, part):
+        if (current := Lock.read(location)) is None or getattr(current, part) != getattr(self, part):
             others = f"{current.driver} has it now" if current else "the store was unlocked, or its run is over"
             raise LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
 
@@ -168,8 +167,7 @@ def _take_over(location: Location, lock: Lock, current: Lock) -> None:
 def release(location: Location, lock: Lock) -> None:
     """Release a store unless another process has taken it over. A failure is only reported."""
     try:
-        current = Lock.read(location)
-        if current is not None and current.holder == lock.holder:
+        if (current := Lock.read(location)) is not None and current.holder == lock.holder:
             location.discard(LOCK_KEY)
             if current.folder == "made":
                 with suppress(OSError):  # It holds a store, or is no folder.

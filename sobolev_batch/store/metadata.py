@@ -138,8 +138,7 @@ def _problem_of_array(node: str, document: Document) -> str:
     if document.get("storage_transformers"):
         return f"{node} has the storage transformers {_shown(document['storage_transformers'])}"
     for key, expected in (("chunk_grid", "regular"), ("chunk_key_encoding", "default")):
-        value = document.get(key)
-        if not isinstance(value, dict) or value.get("name") != expected:
+        if not isinstance(value := document.get(key), dict) or value.get("name") != expected:
             return f"the {key} of {node} is {_shown(value)}"
     shape, grid = document.get("shape"), document["chunk_grid"].get("configuration")
     chunk = grid.get("chunk_shape") if isinstance(grid, dict) else grid

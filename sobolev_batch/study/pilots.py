@@ -92,8 +92,7 @@ class Look:
         for label, (_, member) in members.items():
             if label in self.extents or label in self.set_aside or not member.is_quickly_loaded:
                 continue
-            left -= member.expected_size().projected_bytes
-            if left < 0:
+            if (left := left - member.expected_size().projected_bytes) < 0:
                 break
             self.at(label, member, similarity, reference)
 

@@ -108,8 +108,7 @@ class StudyObject:
             with naming(f"family {family.name!r}"):
                 listed = [_with_other_names(one, family.name) for one in family.source.members(self.folder)]
             for member in listed:
-                label = f"{family.name}/{member.name}"
-                if label in members:
+                if (label := f"{family.name}/{member.name}") in members:
                     raise StudyError(f"two surfaces of the study have the label {label!r}")
                 members[label] = family.name, member
         if not isinstance(self.reference, FamilyReference):
@@ -314,8 +313,7 @@ def _with_other_names(member: Member, family: str) -> Member:
         named = ((f"target_{name}" if _is_taken(name) else name, value) for name, value in member.metadata)
         member = replace(member, metadata=tuple(named))
     for name, value in member.metadata:
-        problem = node_problem(name)
-        if problem is None and _is_taken(name):
+        if (problem := node_problem(name)) is None and _is_taken(name):
             problem = f"tables use that themselves; rename it, for example to {family}_{name}"
         if problem is not None:
             raise StudyError(f"the metadata of {quoted(member.name)} have the name {quoted(name)}: {problem}")

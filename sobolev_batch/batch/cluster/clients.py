@@ -174,8 +174,7 @@ def require_blocking(client: Client) -> None:
 
 def memory_limit(memory: float | str, workers: int) -> int:
     """Return the memory of each worker in bytes; refuse too little for one, or more than there is for all."""
-    limit = byte_count(memory)
-    if limit < _LEAST_BYTES:
+    if (limit := byte_count(memory)) < _LEAST_BYTES:
         raise InputError(f"the memory of a worker must be at least {format_bytes(_LEAST_BYTES)}, found {memory!r}")
     require_machine_memory(limit, "the memory of a worker")
     require_machine_memory(workers * limit, f"the memory of {workers} workers", "for each, or take fewer")

@@ -330,8 +330,7 @@ class _Loop(Generic[Result]):
             run, task = self._running.pop(future)
             run.in_flight -= 1
             runs[run] = None
-            was_alone = task is self._alone
-            if was_alone:
+            if was_alone := task is self._alone:
                 self._alone = None
             if not isinstance(outcome, KilledWorker):
                 self._give(run, task, outcome)
