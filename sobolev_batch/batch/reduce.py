@@ -15,16 +15,7 @@ from distributed import Client
 from pydantic import ValidationError
 
 from sobolev_batch.batch.cluster.clients import check_cluster, local_client
-from sobolev_batch.batch.cluster.execution import (
-    Cluster,
-    Stages,
-    Task,
-    Wave,
-    in_place,
-    result_from,
-    result_of,
-    side_by_side,
-)
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, in_place, result_from, side_by_side, wait_for
 from sobolev_batch.batch.cluster.workers import prepare_workers
 from sobolev_batch.errors import ClusterError, InputError, MeshError, SobolevBatchError, one_line
 from sobolev_batch.geometry.formats.by_name import WRITERS, mesh_format
@@ -292,9 +283,9 @@ def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Calla
         known = yield from result_from(cluster(), read)
     record = known
 
-    def take(_: Task, outcome: Any) -> None:
+    def take(trial: Any) -> None:
         nonlocal record
-        record = search.taken(record, result_of(outcome))
+        record = search.taken(record, trial)
 
     needed = search.projected_bytes(record.triangles)
     while search.next(record):
@@ -302,7 +293,7 @@ def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Calla
             Task(tried, search.trial(record, size), needed, label=f"{search.name}/{size:g}", stage="trial")
             for size in search.next(record, at_once())
         ]
-        yield Wave(cluster(), tasks, take, needed)
+        yield from wait_for(cluster(), tasks, take, needed)
     reason, folder = search.reason(record), search.folder
     path = str(folder.below(search.mesh_key)) if isinstance(folder, Location) and not reason else ""
     mesh = None if reason or path else search.mesh(record)

@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import xarray as xr
 
-from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_from, result_of
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, result_from, wait_for
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.sources.registry import digest_of
@@ -53,18 +52,13 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
     advance = cluster.count_steps("tables", len(chunks) + len(tiles))
     parts = ((evaluator.only(rows), n, {row: keys[row] for row in rows if row in keys}) for n, rows in chunks.items())
     of_spectra = (Task(fill_chunk, part, projected_bytes, stage="spectra") for part in parts)
-
-    def take(task: Task, outcome: Any) -> None:
-        result_of(outcome)
-        advance("", None)
-
-    yield Wave(cluster, of_spectra, take, projected_bytes)
+    yield from wait_for(cluster, of_spectra, lambda _: advance("", None), projected_bytes)
     if pairs is not None:
         # Pairs wait for all spectra, from which their row of the reference comes.
         own_pairs = ((pairs.only(tile), tile) for tile in tiles)
         of_tiles = ((evaluator.only(own.keys), own, tile) for own, tile in own_pairs)
         of_pairs = (Task(fill_tile, of_tile, projected_bytes, stage="pairs") for of_tile in of_tiles)
-        yield Wave(cluster, of_pairs, take, projected_bytes)
+        yield from wait_for(cluster, of_pairs, lambda _: advance("", None), projected_bytes)
     last = Task(write_results, (workspace, evaluator, meshes, digest, replaced), projected_bytes, stage="tables")
     tabulated: Tabulated
     tabulated, store.metadata = yield from result_from(cluster, last)

@@ -163,10 +163,17 @@ def result_of(outcome: Any) -> Any:
     return outcome
 
 
+def wait_for(
+    cluster: Cluster, tasks: Iterable[Task], take: Callable[[Any], None], projected_bytes: float
+) -> Stages[None]:
+    """Wait for tasks that must not fail, and take the result of each; see `Wave`."""
+    yield Wave(cluster, tasks, lambda _, outcome: take(result_of(outcome)), projected_bytes)
+
+
 def result_from(cluster: Cluster, task: Task) -> Stages[Any]:
     """Wait for one task, which must not fail, and return its result."""
     found: list[Any] = []
-    yield Wave(cluster, [task], lambda _, outcome: found.append(result_of(outcome)), task.projected_bytes)
+    yield from wait_for(cluster, [task], found.append, task.projected_bytes)
     return found[0]
 
 
