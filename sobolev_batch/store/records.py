@@ -27,9 +27,6 @@ from sobolev_batch.transform.fourier import NUMERICS_VERSION
 
 _log = logging.getLogger(__name__)
 
-Status = Literal["complete", "failed"]
-
-_ROW = "row"
 # This JSON takes the place of a record that a page holds and that counts no more.
 _WITHDRAWN = "null"
 
@@ -112,7 +109,7 @@ class _Line:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     def to_json(self, row: int) -> str:
-        return json.dumps({_ROW: row, **asdict(cast(Any, self))})
+        return json.dumps({"row": row, **asdict(cast(Any, self))})
 
     @classmethod
     def from_json(cls, text: str, row: int) -> Self | None:
@@ -124,7 +121,7 @@ class _Line:
             table = dict(json.loads(text))
         except (ValueError, TypeError, RecursionError) as error:
             raise damaged_record(name, f"no table: {error}", text) from error
-        if (stored_row := table.pop(_ROW, None)) != row:
+        if (stored_row := table.pop("row", None)) != row:
             raise damaged_record(name, f"it is that of row {stored_row!r}", text)
         return record_in(cls, table, name)
 
@@ -148,7 +145,7 @@ class Record(_Line):
     """
 
     key: str
-    status: Status
+    status: Literal["complete", "failed"]
     reason: str = ""
     remark: str = ""
     facts: Facts = Facts()
@@ -203,8 +200,6 @@ class ObjectRecord(_Line):
 
 
 RecordType = TypeVar("RecordType", Record, ObjectRecord)
-# A record for each surface, unless others are asked for.
-_SURFACES: Any = Record
 
 
 @dataclass(frozen=True)
@@ -212,7 +207,7 @@ class Records(Generic[RecordType]):
     """The records of the rows of a store, alone and in pages: of surfaces, or of the objects of a study at its root."""
 
     store: Store
-    type: type[RecordType] = _SURFACES
+    type: type[RecordType] = Record  # type: ignore[assignment]  # of surfaces, unless others are asked for
 
     def examine(self) -> tuple[list[RecordType | None], dict[int, str]]:
         """Return the completion record of each row, None if it has none that can be read, and the damage of those."""
