@@ -184,10 +184,8 @@ class Store:
         if of_objects and not has_objects:
             raise ForeignError(f"{self.path}: the store of one object, and the study names several; name another store")
         if has_objects and of_objects is False:
-            first = next(iter(attributes["study"][OBJECTS]), "NAME")
-            raise ForeignError(
-                f"{self.path}: the store of several objects; name that of one, such as {self.path}/{first}"
-            )
+            one = f"{self.path}/{next(iter(attributes['study'][OBJECTS]), 'NAME')}"
+            raise ForeignError(f"{self.path}: the store of several objects; name that of one, such as {one}")
         try:
             Similarity(**({} if has_objects else attributes["similarity"]))
         except (KeyError, TypeError, InputError) as error:
