@@ -240,11 +240,9 @@ class Records(Generic[RecordType]):
     def read(self) -> tuple[RecordType | None, ...]:
         """Return the completion record of each row, or None if it has none that can be read."""
         records, damage = self.examine()
-        names = self.store.names_of_rows(len(records)) if damage else ()
+        names, path = self.store.names_of_rows(len(records)) if damage else (), self.store.path
         for row, what in damage.items():
-            _log.warning(
-                "%s: the record of %s is damaged and counts as not there: %s", self.store.path, names[row], what
-            )
+            _log.warning("%s: the record of %s is damaged and counts as not there: %s", path, names[row], what)
         return tuple(records)
 
     def read_one(self, row: int, *, of_this_run: bool = False) -> RecordType | None:
