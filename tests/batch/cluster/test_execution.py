@@ -332,7 +332,7 @@ def test_an_asynchronous_client_and_an_address_are_refused_before_anything_is_ma
         with pytest.raises(InputError, match=r"the client is asynchronous.*give a Client without asynchronous=True"):
             act(Study.from_table(small_table()), "memory://asynchronous.zarr", asynchronous)
         with pytest.raises(
-            InputError, match=rf"client must be a dask\.distributed\.Client, found '{address}'; for the"
+            InputError, match=rf"client must be a dask\.distributed\.Client, found '{address}'; give Client"
         ):
             act(Study.from_table(small_table()), "memory://asynchronous.zarr", address)
 
