@@ -362,8 +362,7 @@ def _forecast(
     """
     if not (missing := round(weight * sum(len(one.task_seconds) for one in objects))):
         lacks_tables = any(one.lacks_tables for one in objects)
-        text = "no field is missing, and tables follow from them" if lacks_tables else "nothing is missing"
-        return 0.0, 0.0, (text,)
+        return 0.0, 0.0, ("no field is missing, and tables follow from them" if lacks_tables else "nothing is missing",)
     work = weight * sum(one.processor_seconds for one in objects)
     processes = start = 0.0
     if starts_processes:

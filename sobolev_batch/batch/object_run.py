@@ -245,8 +245,7 @@ def _damaged_rows(workspace: Workspace) -> list[int]:
 
 def lacks_nothing(workspace: Workspace) -> bool:
     """Return True where nothing of a plan is missing in its store, or outdated: fields, tables, other distances."""
-    is_current = not workspace.pending and not workspace.outdated
-    return is_current and are_tabulated(workspace) and have_proximities(workspace)
+    return not (workspace.pending or workspace.outdated) and are_tabulated(workspace) and have_proximities(workspace)
 
 
 def _rows_of_all(workspace: Workspace, tables: Tables | None) -> bytes | None:

@@ -32,8 +32,7 @@ class Fields:
         """Return the places of a field's values: its blocks, in the order of a plan's blocks, and then its octaves."""
         array = self.store.array(FIELD)
         axes = map(slices, array.shape[1:], array.chunks[1:])
-        has_octaves = OCTAVES in self.store.documents
-        octaves = [(slice(0, self.store.document(OCTAVES)["shape"][1]),)] if has_octaves else []
+        octaves = [(slice(0, self.store.document(OCTAVES)["shape"][1]),)] if OCTAVES in self.store.documents else []
         return (*product(*axes), *octaves)
 
     def blocks_of(self, lattice: Lattice) -> tuple[Block, ...]:
@@ -68,8 +67,7 @@ class Fields:
             with store.location.access("read"):
                 try:
                     # It is read in place: copying a field costs as much as reading it.
-                    buffer = NDBuffer.from_numpy_array(values[i])
-                    array.get_basic_selection((rows[i], *place), out=buffer)
+                    array.get_basic_selection((rows[i], *place), out=NDBuffer.from_numpy_array(values[i]))
                 except damage as error:
                     raise _damage(store, rows[i], str(error)) from error
             if checksums is not None and checksum_of(values[i]) != checksums[i]:

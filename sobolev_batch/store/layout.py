@@ -372,8 +372,7 @@ class Store:
         with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:
             # A thread takes longer to start than a file to be read.
             each = pool.map if self.location.scheme else map
-            contents = each(self.location.read, unknown, unknown.values())
-            for key, content in zip(unknown, contents, strict=True):
+            for key, content in zip(unknown, each(self.location.read, unknown, unknown.values()), strict=True):
                 self._hashes[key] = hashlib.sha256(content or b"").hexdigest(), tags.get(key, "")
         return document_digest([root, {key: self._hashes[key][0] for key in keys}])
 

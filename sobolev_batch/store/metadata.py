@@ -54,8 +54,7 @@ def chunk_shape(document: Mapping[str, Any]) -> list[int]:
 def consolidated(documents: Mapping[str, Document]) -> Document:
     """Return the document at the root with those of all nodes, as zarr consolidates them."""
     # Readers list the variables of a group in this order: the number and its error first.
-    names = sorted(filter(None, documents), key=lambda name: name.split("/")[0])
-    nodes = {name: documents[name] for name in names}
+    nodes = {name: documents[name] for name in sorted(filter(None, documents), key=lambda name: name.split("/")[0])}
     attributes = documents[""].get("attributes", {})
     texts = {name: json.dumps(attributes[name]) for name in _TABLES if name in attributes}
     listed = {"kind": "inline", "must_understand": False, "metadata": nodes}

@@ -36,8 +36,7 @@ def arrays_of(store: Store, keys: str) -> list[str]:
 def missing_chunks(store: Store, keys: str) -> set[Index]:
     """Return the places that are not there as a whole. No chunk is read."""
     sizes, axes = store.location.sizes(keys.split("/")[0]), len(store.document(keys)["shape"])
-    names = [keys, *arrays_of(store, keys)]
-    return {index[:axes] for name in names for index in store.incomplete_chunks(name, sizes)}
+    return {index[:axes] for name in [keys, *arrays_of(store, keys)] for index in store.incomplete_chunks(name, sizes)}
 
 
 def damaged_chunks(store: Store) -> Iterator[tuple[tuple[str, Index], str]]:

@@ -96,8 +96,7 @@ def _larger_lattice(
     highest = lattice.xi_max * min(max(needed, default=1.0), _LARGEST_GROWTH)
     images = max(1.0, *(aliasing / accuracy.aliasing_part).tolist())
     period = 1 / lattice.spacing + math.log(images) / (2 * math.pi) * 1.1
-    is_same = (highest, period) == (lattice.xi_max, 1 / lattice.spacing)
-    if is_same or 2 * highest * period > accuracy.largest_intervals:
+    if (highest, period) == (lattice.xi_max, 1 / lattice.spacing) or 2 * highest * period > accuracy.largest_intervals:
         return None
     return lattice_of(highest, period, accuracy.largest_intervals), None
 

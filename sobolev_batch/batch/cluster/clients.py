@@ -215,8 +215,7 @@ def require_private(name: str, who: str, trust_network: bool = False) -> None:
         if not host or not 0 < port < 65536:
             raise ValueError("it has no host, or a port out of range")
     except ValueError as error:
-        message = f"{name!r} is not the address of a scheduler ({error}); one is tls://host:8786"
-        raise InputError(message) from error
+        raise InputError(f"{name!r} is not the address of a scheduler ({error}); one is tls://host:8786") from error
     if trust_network or scheme in ("tls", "wss"):
         return
     try:

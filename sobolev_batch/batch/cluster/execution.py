@@ -286,8 +286,7 @@ class _Loop(Generic[Result]):
             if not self._ready:
                 continue
             run = self._ready[0]
-            threads = run.wave.cluster.workers.threads
-            if len(self._running) >= max(_FEWEST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * threads):
+            if len(self._running) >= max(_FEWEST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * run.wave.cluster.workers.threads):
                 return
             self._ready.rotate(-1)
             try:
@@ -321,8 +320,7 @@ class _Loop(Generic[Result]):
         if self._completed is None:
             self._completed = as_completed(loop=cluster.client.loop)
             self._most_runs = max(_FEWEST_RUNS, _RUNS_PER_THREAD * cluster.workers.threads)
-        claims_memory = run.wave.projected_bytes > cluster.workers.allowed_bytes_per_task
-        future = cluster.submit(task, claims_memory)
+        future = cluster.submit(task, run.wave.projected_bytes > cluster.workers.allowed_bytes_per_task)
         self._running[future] = run, task
         run.in_flight += 1
         self._completed.add(future)

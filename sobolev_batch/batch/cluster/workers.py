@@ -86,8 +86,7 @@ class Workers:
     @classmethod
     def of_this_machine(cls, count: int) -> Workers:
         """Return the workers of a cluster that a run without a scheduler would start here."""
-        allowed = allowed_bytes(machine_memory()[0] / count)
-        return cls((WorkerInfo("this machine", 1, allowed, "cpu", ""),) * count)
+        return cls((WorkerInfo("this machine", 1, allowed_bytes(machine_memory()[0] / count), "cpu", ""),) * count)
 
     @property
     def threads(self) -> int:
