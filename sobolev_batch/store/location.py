@@ -401,10 +401,9 @@ class RemoteStore(FsspecStore):
         if len(keys) == 1:
             await self.delete(keys[0])
             return
-        # Drivers take a path for a pattern.
-        paths = [escape(f"{self.path}/{key}") for key in keys]
         async with _if_present():
-            await self.fs._rm(paths)
+            # Drivers take a path for a pattern.
+            await self.fs._rm([escape(f"{self.path}/{key}") for key in keys])
 
     async def delete_dir(self, prefix: str) -> None:
         """Remove all keys below a prefix."""

@@ -43,9 +43,8 @@ def study_schema() -> dict[str, Any]:
         own = {"source": {"const": name}, **keys[model]["properties"]}
         known[name] = {**keys[model], "properties": own, "required": ["source", *keys[model].get("required", ())]}
         tables.append({**known[name], "properties": {**own, **of_search, **of_family}, "required": ["name", "source"]})
-    of_mesh: list[dict[str, Any]] = [{"type": "string"}, _OF_NAMED, *({"$ref": f"#/$defs/{name}"} for name in sources)]
     keys[Source].clear()
-    keys[Source].update(anyOf=of_mesh)
+    keys[Source].update(anyOf=[{"type": "string"}, _OF_NAMED, *({"$ref": f"#/$defs/{name}"} for name in sources)])
     keys[Family].clear()
     keys[Family].update(anyOf=[{**_OF_NAMED, "required": ["name", "mesh"]}, *tables[:-1]])
     keys[FamilyReference].update(known.pop("family"))

@@ -409,10 +409,9 @@ def require_store_access(client: Client, location: Location, lock: Lock) -> None
 def _problem(location: Location, lock: Lock) -> str:
     """Return why the process that runs this does not see the store; empty if it does."""
     try:
-        sees_lock = lock.is_held(location)
+        return "" if lock.is_held(location) else f"{location} is another place there; name one that all machines share"
     except StoreError as error:
         return str(error)
-    return "" if sees_lock else f"{location} is another place there; name one that all machines share"
 
 
 def dask_setup(worker: Worker) -> None:
