@@ -26,7 +26,7 @@ from sobolev_batch.store.layout import Store
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.records import Facts, Record, Records
 from sobolev_batch.study.plan import Plan, Row
-from sobolev_batch.study.schema import Backends
+from sobolev_batch.transform.backends import Backends
 from sobolev_batch.transform.fourier import (
     NUMERICS_VERSION,
     ErrorTarget,

@@ -22,11 +22,10 @@ from sobolev_batch.sources.files import MeshTable, checked_list
 from sobolev_batch.sources.names import known_names, name_problem, node_problem, quoted
 from sobolev_batch.sources.registry import Source, at_most, parse_source, source_type_of
 from sobolev_batch.study.toml import DEEPEST
+from sobolev_batch.transform.backends import Backends
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, check_orders
 
-# "auto" leaves it to each worker.
-Backends = Literal["auto", "cpu", "gpu"]
 Metric = Literal[
     "hausdorff", "mean", "rms", "bias", "percentiles", "chamfer", "fscore", "normals", "volume", "triangles"
 ]

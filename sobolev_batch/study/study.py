@@ -21,16 +21,10 @@ from sobolev_batch.sources.command import function_name
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import caseless_key, duplicate_names, fits, known_names, node_problem, quoted
 from sobolev_batch.sources.registry import Member, Source, single_member
-from sobolev_batch.study.schema import (
-    REFERENCE_LABEL,
-    Backends,
-    Family,
-    FamilyReference,
-    ProximitySection,
-    SurfaceSections,
-)
+from sobolev_batch.study.schema import REFERENCE_LABEL, Family, FamilyReference, ProximitySection, SurfaceSections
 from sobolev_batch.study.templates import sections_of_objects
 from sobolev_batch.study.toml import plain_tables, read_toml
+from sobolev_batch.transform.backends import Backends
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, check_orders
 

@@ -28,6 +28,8 @@ from sobolev_batch.transform.nufft_costs import CPU_COSTS, FINEST_EPS, GPU_COSTS
 
 Result = TypeVar("Result")
 
+# What a study may ask for; "auto" leaves it to each worker.
+Backends = Literal["auto", "cpu", "gpu"]
 INSTALL = "pip install 'sobolev-batch[gpu]'"
 # cuFINUFFT is linked against the first two, and CuPy compiles with the third. cuFINUFFT's wheel neither declares them
 # nor finds them where pip puts them: they must be in the process before it is imported.

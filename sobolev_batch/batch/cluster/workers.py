@@ -30,8 +30,7 @@ from sobolev_batch.parameters import format_bytes
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock
 from sobolev_batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.study.schema import Backends
-from sobolev_batch.transform.backends import CPU, INSTALL, Backend, gpu_backend
+from sobolev_batch.transform.backends import CPU, INSTALL, Backend, Backends, gpu_backend
 from sobolev_batch.transform.fourier import NUMERICS_VERSION, slowness
 from sobolev_batch.visible import make_messages_visible
 
