@@ -163,11 +163,9 @@ def result_of(outcome: Any) -> Any:
     return outcome
 
 
-def wait_for(
-    cluster: Cluster, tasks: Iterable[Task], take: Callable[[Any], None], projected_bytes: float
-) -> Stages[None]:
+def wait_for(cluster: Cluster, tasks: Iterable[Task], take: Callable[[Any], None], most_bytes: float) -> Stages[None]:
     """Wait for tasks that must not fail, and take the result of each; see `Wave`."""
-    yield Wave(cluster, tasks, lambda _, outcome: take(result_of(outcome)), projected_bytes)
+    yield Wave(cluster, tasks, lambda _, outcome: take(result_of(outcome)), most_bytes)
 
 
 def result_from(cluster: Cluster, task: Task) -> Stages[Any]:
