@@ -92,7 +92,7 @@ class Fields:
 
     def complete_rows(self) -> set[int]:
         """Return the rows whose blocks all exist in their full length. No block is read."""
-        rows = set(range(self.store.row_count))
+        rows = set(range(self.store.document(FIELD)["shape"][0]))
         for name in self.store.documents.keys() & {FIELD, OCTAVES}:
             rows -= {place[0] for place in self.store.incomplete_chunks(name, self.store.location.sizes(f"{name}/c"))}
         return rows

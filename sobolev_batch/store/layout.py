@@ -212,11 +212,6 @@ class Store:
         """Labels of the meshes that the study has lost; their fields stay, in case they come back."""
         return frozenset(self.attributes().get(REMOVED, ()))
 
-    @property
-    def row_count(self) -> int:
-        """Number of rows."""
-        return int(self.document(FIELD)["shape"][0])
-
     def labels(self) -> tuple[str, ...]:
         """Return the label of each row."""
         return self.read_strings(LABELS)

@@ -20,7 +20,7 @@ from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integr
 from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.store.field_arrays import Fields
-from sobolev_batch.store.layout import Store
+from sobolev_batch.store.layout import FIELD, Store
 from sobolev_batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.transform.lattice import Block, Lattice, SobolevWeights, shell_sums
 
@@ -112,7 +112,7 @@ class Evaluator:
     ) -> Self:
         """Return the evaluator of rows with stored qualities; distances are to the reference, or another row."""
         qualities = {row: Quality.from_json(text) for row, text in stored.items()}
-        count = store.row_count
+        count = store.document(FIELD)["shape"][0]
         known = reference if reference in qualities else None
         extents = [quality.extent for quality in qualities.values()]
         evaluator = cls(
