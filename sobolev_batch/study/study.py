@@ -118,17 +118,12 @@ class StudyObject:
 
         A name may begin with that of the object, or be no more than that.
         """
-
-        def names_of(label: str, family: str) -> Iterator[str]:
-            yield from (family, label)
-            if self.name:
-                yield from (self.name, f"{self.name}/{family}", f"{self.name}/{label}")
-
-        return {
-            label
-            for label, (family, _) in self.members.items()
-            if any(fits(name, one) for one in only for name in names_of(label, family))
-        }
+        chosen = set()
+        for label, (family, _) in self.members.items():
+            own = (self.name, f"{self.name}/{family}", f"{self.name}/{label}") if self.name else ()
+            if any(fits(name, one) for name in (family, label, *own) for one in only):
+                chosen.add(label)
+        return chosen
 
     @property
     def sources(self) -> list[Source]:
