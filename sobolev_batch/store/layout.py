@@ -166,7 +166,7 @@ class Store:
 
         StoreError where it is the other one of the two, unless None allows both.
         """
-        if not self.exists() or self.documents[""].get("node_type") != "group":
+        if not self.exists():
             is_absent = not self.location.scheme and not os.path.lexists(self.path)
             raise ForeignError(f"{self.path}: it {'does not exist' if is_absent else 'holds no store of a study'}")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
@@ -269,8 +269,7 @@ class Store:
         Qualities are a copy of what records have, and not among them.
         """
         others = {*_OF_ROWS, QUALITY, *self.keyed_arrays()}
-        arrays = (name for name, document in self.documents.items() if document.get("node_type") == "array")
-        return [name for name in arrays if name not in others]
+        return [name for name in self.documents if "/" in name and name not in others]
 
     @property
     def _arrays_in_progress(self) -> frozenset[str]:

@@ -13,8 +13,6 @@ from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast
 
-from pydantic import ConfigDict
-
 from sobolev_batch.errors import DamageError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
@@ -106,7 +104,7 @@ class ProximityRecord:
 class _Line:
     """A record as one line of JSON, which begins with its row: records of rows may trade places."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    __pydantic_config__: ClassVar[Any] = {"extra": "forbid"}
 
     def to_json(self, row: int) -> str:
         return json.dumps({"row": row, **asdict(cast(Any, self))})
