@@ -162,9 +162,8 @@ def run_object(study: Study, root: Location, cluster: Cluster, workspace: Worksp
 
 def workspace_at_hand(study: Study, location: Location) -> Workspace | None:
     """Return the workspace of an only object where planning takes no more than reading its reference."""
-    if study.object.name or (study.accuracy is not None and stored_choice(location) is None):
-        return None
-    return Workspace.of_study(study, location)
+    is_quick = study.accuracy is None or stored_choice(location) is not None
+    return Workspace.of_study(study, location) if is_quick else None
 
 
 def begin(study: Study, location: Location, workers: Workers | None) -> Begun | Workspace:
