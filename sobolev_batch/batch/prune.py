@@ -1,7 +1,6 @@
 """Pruning: what a store keeps and no record needs, counted and removed."""
 
 import re
-from collections import Counter
 from contextlib import nullcontext
 
 from sobolev_batch.store.encoding import ROOT
@@ -45,8 +44,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
         contents = Contents.of_store(store)
         lost, kept = set(range(len(contents.labels))) - contents.rows.keys(), contents.complete.keys()
         listed = {name.split("/")[0] for name in store.documents} | {ROOT, TAGS, *LOCK_KEYS}
-        counts: Counter[str] = Counter()
-        prefixes = set()
+        counts, prefixes = dict.fromkeys((_LOST, _KILLED, _UNLISTED), 0), set[str]()
         for key, size in location.sizes("").items():
             if PARTIAL_FILE.search(key):
                 counts[_KILLED] += size
@@ -65,4 +63,4 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
             location.remove_partial_files()
             for prefix in prefixes:
                 location.remove(prefix)
-    return {kind: counts[kind] for kind in (_LOST, _KILLED, _UNLISTED)}
+    return counts

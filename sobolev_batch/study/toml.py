@@ -16,10 +16,8 @@ from sobolev_batch.geometry.formats.parsing import open_regular
 from sobolev_batch.sources.command import function_version
 from sobolev_batch.sources.names import quoted, readable_key, shown_value
 
-# Deeper tables are mistakes.
-DEEPEST = 20
-# Larger study files are mistakes.
-_LARGEST_FILE_BYTES = 4 << 20
+# Deeper tables and larger study files are mistakes.
+DEEPEST, _LARGEST_FILE_BYTES = 20, 4 << 20
 
 
 def read_toml(path: Path) -> dict[str, Any]:
