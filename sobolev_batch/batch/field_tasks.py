@@ -13,7 +13,7 @@ import numpy as np
 
 from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.workers import this_worker, worker_backend
-from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, one_line
+from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, naming, one_line
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, field_for
@@ -106,10 +106,8 @@ class Job:
         if (kept := _reference.get(key)) is not None:
             return kept
         _reference.clear()
-        try:
+        with naming("the reference", MeshError):
             found = self._loaded(self.reference)
-        except MeshError as error:
-            raise MeshError(f"the reference: {error}") from error
         if self.reference.fingerprint and kind_of(found).triangles <= _KEPT_TRIANGLES:
             _reference[key] = found
         return found

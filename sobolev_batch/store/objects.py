@@ -99,8 +99,7 @@ class Objects:
         if not isinstance(study, dict) or OBJECTS not in study:
             return None
         if not root.lacks_tables and not root.has_digest(is_thorough=is_thorough):
-            problem = "the list of its objects, or the table of all rows, is not what was written"
-            raise DamageError(f"{location}: {problem}; run the study again", problem)
+            raise root.damage("the list of its objects, or the table of all rows,", "it is not what was written")
         root.attributes(of_objects=True)
         for name in study[OBJECTS]:
             if unfit := node_problem(name):
