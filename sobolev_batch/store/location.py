@@ -276,7 +276,7 @@ def path_in(root: str | Path, key: str) -> Path:
         path = f"{path}/{name}"
         try:
             mode = os.lstat(path).st_mode
-        except (FileNotFoundError, NotADirectoryError):
+        except _ABSENT:
             break
         if stat.S_ISLNK(mode):
             raise ForeignError(f"{path}: a link, which may lead out of the store; put what it leads to in its place")

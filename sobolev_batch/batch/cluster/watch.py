@@ -18,7 +18,6 @@ from typing import Any, Self
 import dask
 from dask.utils import parse_timedelta
 from distributed import CancelledError, Client
-from distributed.comm import CommClosedError
 
 from sobolev_batch.batch.cluster.workers import GPU
 from sobolev_batch.errors import ClusterError, LockError, StoreError, one_line
@@ -96,7 +95,7 @@ class Watch:
         try:
             with _repeated(self._look_out, _POLL_SECONDS, "watch"):
                 yield self
-        except (OSError, CommClosedError, CancelledError, TimeoutError) as error:
+        except (OSError, CancelledError) as error:
             if not self._has_lost_scheduler:
                 raise
             raise ClusterError(
