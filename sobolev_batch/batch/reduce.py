@@ -213,8 +213,7 @@ def reduce(
         RecordedSearch(one, one, limit, remesher, folder or InMemory(), name, f"{name}{suffix}", precision)
         for name, (one, suffix) in _originals(meshes, folder).items()
     ]
-    found: dict[str, Reduction] = {}
-    by_name = {search.name: search for search in searches}
+    found, by_name = dict[str, Reduction](), {search.name: search for search in searches}
     for name, outcome in _outcomes(searches, client, workers):
         if isinstance(outcome, Exception):
             by_name[name].forget()

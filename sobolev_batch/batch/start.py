@@ -57,8 +57,7 @@ def require_permission(study: Study, allow_commands: bool) -> None:
 
 
 def _require_members(study: Study, only: Sequence[str]) -> None:
-    known: dict[str, None] = {}
-    unknown = list(only)
+    known, unknown = dict[str, None](), list(only)
     for one in study.objects.values() if only else ():
         try:
             families = (family for family, _ in one.members.values())

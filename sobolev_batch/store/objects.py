@@ -209,8 +209,7 @@ def for_each_object(
 
     Errors of an only object without a name are raised, and those that end the work at all objects.
     """
-    results: dict[str, Result] = {}
-    refused: dict[str, str] = {}
+    results, refused = dict[str, Result](), dict[str, str]()
     for name in study.objects:
         try:
             results[name] = act(study.of_object(name), location.below(name) if name else location)

@@ -216,9 +216,7 @@ def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapp
     closest = ESTIMATE_CAUTION * np.min(list(distances.values()), axis=0)
     numbers = range(len(first.orders))
     demanding = dict.fromkeys(min(distances, key=lambda label: distances[label][order]) for order in numbers)
-    lattices: dict[str, Lattice] = {}
-    samplings: list[list[OctaveSampling]] = []
-    shortfalls: dict[str, AccuracyError] = {}
+    lattices, samplings, shortfalls = dict[str, Lattice](), list[list[OctaveSampling]](), dict[str, AccuracyError]()
     for label in demanding:
         try:
             solution = solve_in_octaves(problems[label], 0, _PILOT_FRACTION, for_others=True)
@@ -252,8 +250,7 @@ def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapp
 
 def _on_one_lattice(problems: _Problems, dtype: ComplexDtype | None) -> _Outcome:
     """Choose a lattice that reaches far enough for every pair."""
-    pilots: dict[str, tuple[Reals, Lattice, ComplexDtype]] = {}
-    shortfalls: dict[str, AccuracyError] = {}
+    pilots, shortfalls = dict[str, tuple[Reals, Lattice, ComplexDtype]](), dict[str, AccuracyError]()
     for label, problem in problems.items():
         try:
             pilots[label] = run_pilot(problem)

@@ -51,8 +51,7 @@ def validated(model: type[Sections], values: Mapping[str, Any]) -> Sections:
 
 
 def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
-    messages: list[str] = []
-    allowed: dict[_Key, list[str]] = {}
+    messages, allowed = list[str](), dict[_Key, list[str]]()
     items = error.errors(include_url=False)
     # What is wrong with a named mesh is wrong wherever it is named.
     for item in [item for item in items if item["loc"][:1] == ("mesh",)] or items:

@@ -195,8 +195,7 @@ def _pattern(template: str) -> str:
 
     A placeholder stands for as many characters as it can, of one part of the path; where it is repeated, for the same.
     """
-    seen: set[str] = set()
-    pattern = ""
+    seen, pattern = set[str](), ""
     for part in _PART.split(Path(template).as_posix()):
         if part in (OBJECT, METHOD):
             group = part.strip("{}")
