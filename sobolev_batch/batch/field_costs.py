@@ -116,7 +116,6 @@ def row_seconds(plan: Plan, row: Row) -> float:
     # An accuracy takes coarser settings where it can; what they save is little beside octaves.
     transform = field_seconds(expected.triangles, plan.reference_area, plan.lattice, plan.transform)
     octaves = () if plan.tail is None else plan.tail.octaves
-    sampling = sum(size.sampling_seconds(octave) for octave in octaves)
-    if octaves and row.label != plan.reference:
-        sampling += _COMPARING_SECONDS
+    comparing = _COMPARING_SECONDS if octaves and row.label != plan.reference else 0.0
+    sampling = sum(size.sampling_seconds(octave) for octave in octaves) + comparing
     return _ROW_SECONDS + _TRIANGLE_SECONDS * expected.triangles + expected.seconds + transform + sampling
