@@ -147,15 +147,10 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
     """
 
     idempotent = True
-
-    def __init__(self) -> None:
-        self.backend: Backend = CPU
-        self.info: WorkerInfo | None = None
-        self._device: str | None = None
-
-    def __reduce__(self) -> tuple[type[BackendPlugin], tuple[()]]:
-        # It travels to workers before it has found anything.
-        return BackendPlugin, ()
+    # It travels to workers before it has found any of these.
+    backend: Backend = CPU
+    info: WorkerInfo | None = None
+    _device: str | None = None
 
     async def setup(self, worker: Worker) -> None:
         """Find the backend; in a thread, since loading CUDA takes seconds."""
