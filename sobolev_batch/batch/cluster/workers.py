@@ -221,8 +221,7 @@ def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:
     while True:
         answers = client.run(_describe, on_error="return")
         # A worker that is just leaving, or joining, does not count.
-        members = tuple(answers[address] for address in sorted(answers) if isinstance(answers[address], WorkerInfo))
-        if members:
+        if members := tuple(answers[one] for one in sorted(answers) if isinstance(answers[one], WorkerInfo)):
             return Workers(members)
         if answers.keys() & client.scheduler_info(n_workers=-1)["workers"].keys():
             raise ClusterError("the cluster has no workers; start some with: dask worker ADDRESS")
@@ -251,9 +250,8 @@ def this_worker() -> Worker | None:
 
 def worker_backend(choice: str) -> Backend:
     """Return the backend of the worker that runs this task; the CPU where the study chose that."""
-    worker = this_worker()
-    plugin = None if worker is None or choice == "cpu" else worker.plugins.get(_NAME)
-    return CPU if plugin is None else plugin.backend
+    worker = None if choice == "cpu" else this_worker()
+    return CPU if worker is None else worker.plugins.get(_NAME, BackendPlugin).backend
 
 
 async def _describe(dask_worker: Worker) -> WorkerInfo | None:
