@@ -236,9 +236,8 @@ def _damaged_tables(store: Store) -> dict[str, str]:
     """Return the damage of each small array, of tables and coordinates, of what they say together, and of the run."""
     keyed, names = store.keyed_arrays(), store.whole_arrays()
     expected = [*names, layout.QUALITY, *keyed] if layout.table_names(store) else names
-    groups = {name: name.split("/")[0] for name in expected}
     # Groups of tasks have the fields besides, which are many.
-    prefixes = {name if group in layout.GROUPS_OF_TASKS else group for name, group in groups.items()}
+    prefixes = {name if (group := name.split("/")[0]) in layout.GROUPS_OF_TASKS else group for name in expected}
     sizes = {key: size for prefix in prefixes for key, size in store.location.sizes(prefix).items()}
     incomplete = (name for name in expected if store.incomplete_chunks(name, sizes))
     damage = dict.fromkeys(incomplete, "it is not there, or not all of it")
