@@ -30,14 +30,7 @@ from sobolev_batch.cli.options import (
 from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, Command
 from sobolev_batch.cli.table_commands import table_options
-from sobolev_batch.errors import (
-    InputError,
-    SobolevBatchError,
-    StoreError,
-    from_extra,
-    require_writable,
-    write_file,
-)
+from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra, require_writable, write_file
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.shown import reasons, together

@@ -68,13 +68,7 @@ def convergence(
     return _plot("convergence", Selection.from_store(store, order, family, x), ax)
 
 
-def over_time(
-    store: AnyStore,
-    order: float | None = None,
-    ax: Axes | None = None,
-    *,
-    family: Families = None,
-) -> Axes:
+def over_time(store: AnyStore, order: float | None = None, ax: Axes | None = None, *, family: Families = None) -> Axes:
     """Plot the distances of meshes that move, with a dotted line at the first time at which a new mesh pays.
 
     The parameters are those of `convergence`.

@@ -44,11 +44,7 @@ class Selection:
 
     @classmethod
     def from_store(
-        cls,
-        store: AnyStore,
-        order: Orders | None = None,
-        family: Families = None,
-        x: str = EDGE_LENGTH,
+        cls, store: AnyStore, order: Orders | None = None, family: Families = None, x: str = EDGE_LENGTH
     ) -> Self:
         """Choose any orders, default the study's, and families by names or globs; InputError for an unknown family."""
         tree = as_tree(store)

@@ -85,11 +85,7 @@ def evolution(store: AnyStore, order: Orders | None = None, *, factor: float = R
 
 
 def format_evolution(
-    store: AnyStore,
-    style: Format = "text",
-    orders: Sequence[float] | None = None,
-    *,
-    factor: float = REMESHING_FACTOR,
+    store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None, *, factor: float = REMESHING_FACTOR
 ) -> str:
     """Return the distances of moving meshes as text; see `evolution`."""
     tree = as_tree(store)
