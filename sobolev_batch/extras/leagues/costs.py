@@ -130,7 +130,7 @@ class CostLeague:
 
 
 def cost_leagues_of(
-    tables: Mapping[str, pd.DataFrame], objects: Iterable[str], x: str, methods: Sequence[str]
+    tables: Mapping[str, pd.DataFrame], objects: Iterable[str], methods: Sequence[str], x: str = DEFAULT_COST
 ) -> tuple[CostLeague, ...]:
     """Return the league by cost of each order, from the rows of `table` of each object that has some; see `league`."""
     if x == EDGE_LENGTH:
@@ -207,7 +207,7 @@ def format_cost_leagues(leagues: Sequence[CostLeague], style: Format = "text") -
     return rendered(style, frame[["order", *frame.columns.drop("order")]], sections, notes)
 
 
-def front_columns(x: str) -> tuple[Column, ...]:
+def front_columns(x: str = DEFAULT_COST) -> tuple[Column, ...]:
     """Return the columns of `CostLeague.front`, with a cost of this name."""
     return (
         Column("member", "front of the means", kind="label"),
@@ -219,10 +219,8 @@ def front_columns(x: str) -> tuple[Column, ...]:
 
 def _front_lines(league: CostLeague) -> list[str]:
     """Return a line for the front of each object, from the cheapest mesh to the nearest one."""
-    fronts = (
-        league.meshes[league.meshes["front"]].sort_values(league.x, kind="stable").groupby("object", sort=False)["mesh"]
-    )
-    shown = {name: fronts.get_group(name) for name in league.objects[:_MOST_OBJECTS]}
-    lines = [f"{name}: {', '.join(meshes)}" for name, meshes in shown.items()]
+    front = league.meshes[league.meshes["front"]].sort_values(league.x, kind="stable")
+    labels = front.groupby("object")["mesh"].agg(", ".join)
+    lines = [f"{name}: {labels[name]}" for name in league.objects[:_MOST_OBJECTS]]
     more = len(league.objects) - len(lines)
     return lines + [f"and {more} more objects: --format csv has all"] * (more > 0)

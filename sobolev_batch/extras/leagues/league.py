@@ -146,11 +146,8 @@ class League:
 
     def mean_curve(self, method: str) -> tuple[Reals, Reals]:
         """Return sizes (n,), and means over the objects with the ends of their intervals (n, 3), as in the table."""
-        number, at_sizes = self.methods.index(method), np.stack([self.values_at, self.errors_at]).transpose(3, 0, 1, 2)
-        means = [
-            interval(values[:, number], errors[:, number], within_objects(values)[number])
-            for values, errors in at_sizes
-        ]
+        i, at_sizes = self.methods.index(method), np.stack([self.values_at, self.errors_at]).transpose(3, 0, 1, 2)
+        means = [interval(values[:, i], errors[:, i], within_objects(values)[i]) for values, errors in at_sizes]
         return np.exp(self.sizes.mean(axis=0)), np.exp(means)
 
     @property
@@ -285,26 +282,18 @@ def league(
     {'member': ['0', '1', '2', '3'], 'triangles': [20.0, 80.0, 320.0, 1280.0], 'front': [True, True, True, True]}
     """
     check_choice("by", by, ("size", "cost"))
-    stores: AnyStores = store
-    if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
-        objects = tuple(store)
-    elif found := objects_of(store):
-        objects = found
-    elif by == "cost":
-        tree = as_tree(store)
-        objects = (str(root_attribute(tree, "study")["name"]),)
-        stores = {objects[0]: tree}
-    else:
+    objects = objects_of(store)
+    if not objects and by == "size":
         place = source_of(store) if isinstance(store, xr.DataTree) else store
-        raise StoreError(
-            f"{place}: it holds the store of one object; run a study with several objects, or give the stores of "
-            "single objects by their names"
-        )
-    tables = tables_of(stores, order)
+        raise StoreError(f"{place}: it holds the store of one object; take that of several, or some by their names")
+    if not objects:
+        tree = as_tree(store)  # type: ignore[arg-type]  # stores by name have objects
+        objects = (str(root_attribute(tree, "study")["name"]),)
+        store = {objects[0]: tree}
+    tables = tables_of(store, order)
     if by == "cost":
-        return cost_leagues_of(
-            tables, objects, DEFAULT_COST if x is None else x, chosen_methods(tables.values(), methods)
-        )
+        chosen = chosen_methods(tables.values(), methods)
+        return cost_leagues_of(tables, objects, chosen, DEFAULT_COST if x is None else x)
     return leagues_of(tables, objects, x="triangles" if x is None else x, y=y, methods=methods)
 
 
@@ -363,7 +352,7 @@ def _league(
         why = {method: f"no {y if y != RELATIVE else 'distance'} of {method}" for method in methods}
         why |= {method: f"{method} reproduced it, up to rounding" for method in found}
         if curves:
-            why |= dict.fromkeys(curves, gap_of({method: curve.range for method, curve in curves.items()}))
+            why |= dict.fromkeys(curves, gap_of(curves))
         common = common_sizes([*in_common.values()]) if in_common else None
         if common is None or len(in_common) < min(2, len(methods)):
             left_out[name] = "; ".join(dict.fromkeys(why[method] for method in lacking or methods))
@@ -405,7 +394,7 @@ def _with_common_sizes(curves: Mapping[str, Curve]) -> dict[str, Curve]:
     """Return the curves of most methods, as far as they have sizes in common: those farthest from the others go."""
     kept = dict(curves)
     while len(kept) > 2 and common_sizes([*kept.values()]) is None:
-        middles = {method: sum(curve.range) / 2 for method, curve in kept.items()}
+        middles = {method: (curve.sizes[0] + curve.sizes[-1]) / 2 for method, curve in kept.items()}
         center = float(np.median([*middles.values()]))
         del kept[max(middles, key=lambda method: abs(middles[method] - center))]
     return kept
@@ -459,9 +448,6 @@ def pair_lines(league: League) -> list[str]:
     count, methods = len(league.objects), len(league.table)
     if not lines and methods > 1:
         least = least_objects(len(league.pairs))
-        lines.append(
-            "No two methods differ beyond chance and error."
-            if count >= least
-            else f"The test cannot tell {methods} methods from chance with {objects_text(count)}; take {least} or more."
-        )
+        few = f"The test cannot tell {methods} methods from chance with {objects_text(count)}; take {least} or more."
+        lines.append("No two methods differ beyond chance and error." if count >= least else few)
     return lines

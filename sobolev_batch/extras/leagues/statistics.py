@@ -1,7 +1,7 @@
 """Curves of methods at equal sizes, their intervals, and tests whether two methods differ."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -42,10 +42,6 @@ _MOST_ENUMERATED, _DRAWS, _SEED = 14, 20_000, 0
 _MOST_SIGNS = 1 << 22
 
 
-# Ends of a range of logarithms of sizes.
-Range = tuple[float, float]
-
-
 @dataclass(frozen=True, eq=False)
 class Curve:
     """The distances of the meshes of one method from one object, or another number of theirs.
@@ -59,11 +55,6 @@ class Curve:
     sizes: Reals
     values: Reals
     errors: Reals
-
-    @property
-    def range(self) -> Range:
-        """Smallest and largest size, as logarithms."""
-        return float(self.sizes[0]), float(self.sizes[-1])
 
     def at(self, sizes: Reals) -> tuple[Reals, Reals]:
         """Return the logarithms of the distances at some sizes, on straight lines between the meshes, with errors.
@@ -83,8 +74,7 @@ class Curve:
         if np.ptp(self.sizes) < np.log(_SMALLEST_RANGE):
             return np.nan, np.nan
         centred = self.sizes - self.sizes.mean()
-        square = float(centred @ centred)
-        weights = centred / square
+        weights = centred / float(centred @ centred)
         with np.errstate(invalid="ignore"):
             error = float(np.abs(weights) @ self.errors)
         return float(weights @ self.values), np.inf if np.isnan(error) else error
@@ -131,21 +121,11 @@ def filled(values: Reals) -> Reals:
     return np.where(known, values, of_objects + of_methods)
 
 
-def common_range(ranges: Iterable[Range]) -> Range | None:
-    """Return the range that all have in common, or twice the middle between their ends where these nearly meet."""
-    begins, ends = zip(*ranges, strict=True)
-    low, high = max(begins), min(ends)
-    if low <= high:
-        return low, high
-    middle = (low + high) / 2
-    return (middle, middle) if low - high <= math.log(_LARGEST_GAP) else None
-
-
-def gap_of(ranges: Mapping[str, Range]) -> str:
+def gap_of(curves: Mapping[str, Curve]) -> str:
     """Return which methods have no range of sizes in common."""
-    first = max(ranges, key=lambda method: ranges[method][0])
-    last = min(ranges, key=lambda method: ranges[method][1])
-    begin, end = math.exp(ranges[first][0]), math.exp(ranges[last][1])
+    first = max(curves, key=lambda method: curves[method].sizes[0])
+    last = min(curves, key=lambda method: curves[method].sizes[-1])
+    begin, end = math.exp(curves[first].sizes[0]), math.exp(curves[last].sizes[-1])
     return f"no common range of sizes: {first} begins at {begin:,.5g}, {last} ends at {end:,.5g}"
 
 
@@ -161,8 +141,11 @@ def least_objects(tests: int) -> int:
 
 def common_sizes(curves: Sequence[Curve]) -> Reals | None:
     """Return sizes (5,) in the range that all curves have, all alike between their ends where these nearly meet."""
-    common = common_range([curve.range for curve in curves])
-    return None if common is None else np.linspace(*common, _SIZES)
+    low, high = max(curve.sizes[0] for curve in curves), min(curve.sizes[-1] for curve in curves)
+    if low - high > math.log(_LARGEST_GAP):
+        return None
+    ends = (low, high) if low <= high else ((low + high) / 2,) * 2
+    return np.linspace(*ends, _SIZES)
 
 
 def interval(values: Reals, errors: Reals, spread: float | None = None) -> Reals:
@@ -238,7 +221,7 @@ def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
     given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
     if not isinstance(x, str) or x not in (*numbers, *given):
         only = " (the store has no families of commands, functions or searches, which have it)"
-        hint = only if str(x).startswith("make_") else ""
+        hint = only * str(x).startswith("make_")
         raise InputError(f"no size of meshes is named {quoted(x)}{hint}; known are {', '.join([*numbers, *given])}")
     sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
     # A surface in closed form has none.

@@ -12,14 +12,7 @@ import xarray as xr
 
 from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import InputError
-from sobolev_batch.extras.leagues.costs import (
-    COST_NOTE,
-    DEFAULT_COST,
-    METHOD_COLUMNS,
-    CostLeague,
-    cost_leagues_of,
-    front_columns,
-)
+from sobolev_batch.extras.leagues.costs import COST_NOTE, METHOD_COLUMNS, CostLeague, cost_leagues_of, front_columns
 from sobolev_batch.extras.leagues.league import (
     LEAGUE_NOTE,
     PAIR_COLUMNS,
@@ -239,13 +232,13 @@ def cost_content(tables: Mapping[str, pd.DataFrame], methods: Sequence[str]) -> 
     """Return the leagues by cost of objects, from the rows of `table` of each; none where no cost is known."""
     leagues: Sequence[CostLeague] = ()
     with suppress(InputError):
-        leagues = cost_leagues_of(tables, list(tables), DEFAULT_COST, methods)
+        leagues = cost_leagues_of(tables, tables, methods)
     found = {name: [row for one in leagues for row in _rows(one, name)] for name in ("table", "front")}
     orders = [one.order for one in leagues]
     return {
         "costs": leagues,
         "cost_methods": PageTable("cost-methods", METHOD_COLUMNS, found["table"], orders),
-        "cost_front": PageTable("cost-front", front_columns(DEFAULT_COST), found["front"], orders),
+        "cost_front": PageTable("cost-front", front_columns(), found["front"], orders),
         "cost_note": COST_NOTE.replace("\n", " "),
     }
 

@@ -332,7 +332,7 @@ def priced(distances: Mapping[str, Mapping[int, float]], errors: float = 0.0, la
 
 def by_cost(tables: Mapping[str, pd.DataFrame], x: str = "make_seconds") -> CostLeague:
     methods = list(dict.fromkeys(name for frame in tables.values() for name in frame["family"]))
-    (made,) = cost_leagues_of(tables, [*tables, "later"], x, methods)
+    (made,) = cost_leagues_of(tables, [*tables, "later"], methods, x)
     return made
 
 

@@ -9,6 +9,7 @@ import socket
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -358,7 +359,8 @@ def test_the_page_of_several_objects_opens_with_the_league(objects: str, tmp_pat
 
 def test_a_study_with_costs_has_its_league_by_cost(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert 'id="costs"' not in make_report(store)[0]
-    monkeypatch.setattr(content, "DEFAULT_COST", "triangles")
+    for name in ("cost_leagues_of", "front_columns"):
+        monkeypatch.setattr(content, name, partial(getattr(content, name), x="triangles"))
     text = make_report(store)[0]
     expected = sb.league(store, by="cost", x="triangles")
     data = json.loads(text.split('id="data">')[1].split("</script>")[0])["costs"]
