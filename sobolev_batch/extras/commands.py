@@ -296,7 +296,7 @@ def witness_command(
     length. The study makes the meshes again; a mesh is skipped and named if that fails, or if it is not the one that
     was computed.
     """
-    from sobolev_batch.extras.figures.remade import exported, write_vertex_witness
+    from sobolev_batch.extras.figures.remade import exported, stem_of, write_vertex_witness
 
     made, labels, chosen = exported(store, meshes, orders, folder)
     _require_folder(output)
@@ -308,7 +308,7 @@ def witness_command(
         except SobolevBatchError as error:
             missing[label] = str(error)
             continue
-        path = output / f"{made.stem(label)}.{style}"
+        path = output / f"{stem_of(made.tree, label)}.{style}"
         write_vertex_witness(path, found)
         echo(path)
     for _, line in reasons("", together(missing)):

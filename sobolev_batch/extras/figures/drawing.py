@@ -17,7 +17,7 @@ from scipy.spatial.distance import squareform
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.extras.figures.selection import Selection, families_of, is_sequence, pairs_of
+from sobolev_batch.extras.figures.selection import Selection, families_of, has_pairs, is_sequence, pairs_of
 from sobolev_batch.extras.figures.style import (
     EXTENDS,
     PictureFormat,
@@ -90,8 +90,8 @@ def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
     gone = [shortened(name) for name in frame["family"].drop_duplicates() if name not in set(drawn["family"])]
     families = f"families not drawn: {few_of(gone)}" if gone else ""
     set_title(axes, f"order {order:g}", _absent(frame, selection.x), families)
-    axes.set_xlabel(escaped(label_of(selection.x, study_unit(selection.tree))))
-    axes.set_ylabel("relative Sobolev distance")
+    label = escaped(label_of(selection.x, study_unit(selection.tree)))
+    axes.set(xlabel=label, ylabel="relative Sobolev distance")
 
 
 def draw_rates(found: xr.Dataset, order: float | None, axes: Axes) -> None:
@@ -108,8 +108,7 @@ def draw_rates(found: xr.Dataset, order: float | None, axes: Axes) -> None:
     if len(places) > 1:
         _draw_slope(axes, places, values, _SLOPES["edge_length"])
     set_title(axes, f"order {chosen:g}")
-    axes.set_xlabel("mean edge length")
-    axes.set_ylabel("relative Sobolev distance")
+    axes.set(xlabel="mean edge length", ylabel="relative Sobolev distance")
 
 
 def _absent(frame: pd.DataFrame, x: str) -> str:
@@ -153,8 +152,7 @@ def draw_evolution(selection: Selection, order: float, axes: Axes) -> None:
     if is_marked:
         axes.plot([], [], ":", color="gray", linewidth=1, label="a new mesh pays")
     set_title(axes, f"order {order:g}", f"not drawn: {zeros} equal to the reference" if zeros else "")
-    axes.set_xlabel("time")
-    axes.set_ylabel("Sobolev distance")
+    axes.set(xlabel="time", ylabel="Sobolev distance")
 
 
 def moving_families(selection: Selection) -> list[str]:
@@ -203,8 +201,8 @@ def _describe(axes: Axes, league: League | CostLeague, note: str = "") -> None:
     y = getattr(league, "y", RELATIVE)
     order = f"order {league.order:g}, " if y == RELATIVE else ""
     set_title(axes, f"{order}mean of {objects_text(len(league.objects))}", note)
-    axes.set_xlabel(escaped(label_of(league.x)))
-    axes.set_ylabel("relative Sobolev distance" if y == RELATIVE else escaped(label_of(y)))
+    label = "relative Sobolev distance" if y == RELATIVE else escaped(label_of(y))
+    axes.set(xlabel=escaped(label_of(league.x)), ylabel=label)
 
 
 def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
@@ -259,14 +257,7 @@ def draw_energy(selection: Selection, _item: object, axes: Axes) -> None:
         draw_curve(axes, places, values, errors, selection.styles[family], name)
         named.add(family)
     axes.invert_xaxis()
-    axes.set_xlabel(escaped(f"wavelength in {study_unit(selection.tree)}"))
-    axes.set_ylabel("energy over its limit")
-
-
-def has_pairs(selection: Selection) -> bool:
-    """Return True if the store has the distances of all pairs of meshes."""
-    tree = selection.tree
-    return "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]
+    axes.set(xlabel=escaped(f"wavelength in {study_unit(selection.tree)}"), ylabel="energy over its limit")
 
 
 def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
@@ -276,9 +267,7 @@ def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
     complete = [label for label in complete_meshes(tree) if label in chosen or label == reference]
     pairs = pairs_of(tree, order, MOST_MESHES, complete)
     if pairs is None:
-        raise InputError(
-            'the store has distances to the reference alone; set pairs = "all" in [compare] and run the study again'
-        )
+        raise InputError('there are distances to the reference alone; set pairs = "all" in [compare] and run the study')
     distances, meshes = pairs["distance"].values, pairs["mesh"].values.tolist()
     omission = f"the first {len(meshes)} of {len(complete)} meshes" if len(meshes) < len(complete) else ""
     arrangement = clustered_order(distances)
@@ -301,9 +290,7 @@ def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
         axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=font)
         axes.set_yticks(range(len(labels)), labels, fontsize=font)
     else:
-        axes.set_xticks([])
-        axes.set_yticks([])
-        axes.set_xlabel(f"{len(labels)} meshes, similar ones beside each other")
+        axes.set(xticks=[], yticks=[], xlabel=f"{len(labels)} meshes, similar ones beside each other")
     hide_frame(axes)
 
 
@@ -313,10 +300,10 @@ def _color_range(positive: Reals) -> tuple[float, float, str]:
     inner_low, inner_high = np.percentile(positive, _PERCENTILES)
     most = max(inner_high / inner_low, 2.0)
     ends = bool(inner_low / low > most), bool(high / inner_high > most)
-    extend = EXTENDS[ends]
     low, high = inner_low if ends[0] else low, inner_high if ends[1] else high
     # Equal ends would leave no scale.
-    return (low, high, extend) if low < high else (low / 1.1, high * 1.1, extend)
+    low, high = (low, high) if low < high else (low / 1.1, high * 1.1)
+    return low, high, EXTENDS[ends]
 
 
 def clustered_order(distances: Reals) -> NDArray[np.intp]:
@@ -338,7 +325,7 @@ RATES = Plot(draw_rates, lambda found: found["order"].values.ravel(), 3.6)
 PLOTS: dict[str, Plot] = {
     "convergence": Plot(draw_convergence, lambda selection: selection.orders, 3.6),
     "over-time": Plot(draw_evolution, lambda selection: selection.orders if moving_families(selection) else (), 3.6),
-    "matrix": Plot(draw_matrix, lambda selection: selection.orders if has_pairs(selection) else (), 5.6),
+    "matrix": Plot(draw_matrix, lambda selection: selection.orders if has_pairs(selection.tree) else (), 5.6),
     "spectrum": Plot(draw_spectrum, lambda selection: selection.orders if selection.has_spectra else (), 4.0),
     "energy": Plot(draw_energy, lambda selection: (None,) if selection.has_spectra else (), 3.6),
 }

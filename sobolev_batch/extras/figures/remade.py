@@ -14,7 +14,6 @@ import xarray as xr
 from sobolev_batch.batch.start import MADE_MESHES
 from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra, write_file
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.parameters import as_names, check_flags, path_of
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import file_stem, fits
@@ -44,13 +43,11 @@ class StudyMeshes:
 
     Attributes:
         members: Family and member of each surface that the study lists on this machine, by label.
-        similarity: Similarity from the meshes' own unit of length to the study's.
     """
 
     tree: xr.DataTree
     members: Mapping[str, tuple[str, Member]]
     table: xr.Dataset
-    similarity: Similarity
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree, folder: str | Path) -> Self:
@@ -66,7 +63,7 @@ class StudyMeshes:
             members = study.object.members
         except SobolevBatchError as error:
             raise InputError(f"the study's meshes cannot be listed here: {error}") from error
-        return cls(tree, members, table, similarity_of(tree))
+        return cls(tree, members, table)
 
     def make(self, label: str, most_triangles: float = math.inf) -> tuple[Mesh, Mesh]:
         """Return the mesh of a label in its own unit of length, and in the study's, or SobolevBatchError.
@@ -85,7 +82,7 @@ class StudyMeshes:
         if triangles > most_triangles:
             raise InputError(f"it has {triangles:,.0f} triangles; up to {most_triangles:,} are made again")
         own = self.members[label][1].load()
-        scaled = self.similarity.apply(own)
+        scaled = similarity_of(self.tree).apply(own)
         if not isinstance(own, Mesh) or not isinstance(scaled, Mesh) or scaled.digest != row["digest"].item():
             raise InputError("the study makes another mesh here than the one that was computed; its files have changed")
         return own, scaled
@@ -105,11 +102,12 @@ class StudyMeshes:
         values = witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
         title = f"{label} against {reference_of(self.tree)}, study {root_attribute(self.tree, 'study')['name']}"
         lengths = None if reference is None else named_distances(own, reference)
-        return VertexWitness(own, values, orders, title, 1 / self.similarity.scale, lengths)
+        return VertexWitness(own, values, orders, title, 1 / similarity_of(self.tree).scale, lengths)
 
-    def stem(self, label: str) -> str:
-        """Return the file name of a mesh without suffix: its number in the store and the plain letters of its label."""
-        return file_stem(int(self.table.indexes["mesh"].get_loc(label)), label)
+
+def stem_of(tree: xr.DataTree, label: str) -> str:
+    """Return the file name of a mesh without suffix: its number in the store and the plain letters of its label."""
+    return file_stem(int(tree["meshes"].indexes["mesh"].get_loc(label)), label)
 
 
 def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
@@ -128,18 +126,13 @@ def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
         among = candidates if is_pattern else known
         matches = [name] if name in labels else [label for label in among if fits(label, name)]
         chosen += matches
-        if is_pattern and not matches:
-            such = f"its labels are such as {_listed(candidates or known)}"
-            raise InputError(f"the store has no computed mesh with triangles that matches {name!r}; {such}")
         if not matches:
-            similar = difflib.get_close_matches(name, known, n=1)
-            remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {_listed(known)}"
-            raise InputError(f"the store has no mesh {name!r}, {remedy}")
+            similar = [] if is_pattern else difflib.get_close_matches(name, known, n=1)
+            such = ", ".join(map(repr, (among or known)[:_MOST_LISTED]))
+            remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {such}"
+            what = "computed mesh with triangles that matches" if is_pattern else "mesh"
+            raise InputError(f"the store has no {what} {name!r}; {remedy}")
     return tuple(dict.fromkeys(chosen))
-
-
-def _listed(labels: Sequence[str]) -> str:
-    return ", ".join(repr(label) for label in labels[:_MOST_LISTED])
 
 
 def fields_of(tree: xr.DataTree, label: str) -> tuple[xr.DataArray, xr.DataArray]:

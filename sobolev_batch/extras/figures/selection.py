@@ -130,20 +130,22 @@ def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
     return [name for name in known if name in chosen]
 
 
-def pairs_of(
-    tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
-) -> xr.Dataset | None:
+def has_pairs(tree: xr.DataTree) -> bool:
+    """Return True if an open store has the distances of all pairs of meshes."""
+    return "distances" in tree.children and tree["distances"].sizes["mesh"] == tree["distances"].sizes["other"]
+
+
+def pairs_of(tree: xr.DataTree, order: float, most: int, among: Collection[str] | None = None) -> xr.Dataset | None:
     """Return `distance` and `error` of one order between the computed meshes, over `mesh` and `other`, symmetric.
 
-    They may be limited to the first ones, or to some labels, and the reference. None without distances of all pairs.
+    They are limited to the first ones, or those of some labels, and the reference. None without those of all pairs.
     """
-    stored = finished_group(tree, "distances", load=False)
-    if stored.sizes["other"] != stored.sizes["mesh"]:
+    if not has_pairs(tree):
         return None
     reference, complete = reference_of(tree), complete_meshes(tree)
     wanted = {*complete} if among is None else {*among}
     others = [label for label in complete if label != reference and label in wanted]
-    kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
+    kept = others[: max(0, most - 1)] + [reference] * (reference in complete)
     return distances_at(tree, order)[["distance", "error"]].sel(order=order, mesh=kept, other=kept).load()
 
 

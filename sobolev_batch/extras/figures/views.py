@@ -22,7 +22,7 @@ from shapely import MultiPoint
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.extras.figures.remade import StudyMeshes, fields_of, matching_labels
+from sobolev_batch.extras.figures.remade import StudyMeshes, fields_of, matching_labels, stem_of
 from sobolev_batch.extras.figures.selection import Families, Selection, chosen_families
 from sobolev_batch.extras.figures.style import (
     EXTENDS,
@@ -41,7 +41,6 @@ from sobolev_batch.geometry.subdivision import subdivided
 from sobolev_batch.geometry.surface import normals
 from sobolev_batch.norms.causes import witness
 from sobolev_batch.parameters import check_choice
-from sobolev_batch.sources.names import file_stem
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import finished_group
 from sobolev_batch.testing.difference import witness_at_vertices
@@ -318,13 +317,9 @@ def draw_mesh(axes: Axes, view: MeshView, index: int = 0, limit: float | None = 
     light = _AMBIENT + (1 - _AMBIENT) * np.clip(across @ _LIGHT, 0, 1)
     values = view.values[index][view.triangles].mean(axis=1)
     mapping = _mapping(view, view.color_limits[index] if limit is None else limit)
-    colors = mapping.to_rgba(values)[:, :3] * light[:, None]
     order = np.argsort(corners[:, :, 2].mean(axis=1))
-    axes.add_collection(
-        PolyCollection(
-            list(corners[order, :, :2]), facecolors=colors[order], edgecolors="face", linewidths=0.3, rasterized=True
-        )
-    )
+    faces, colors = list(corners[order, :, :2]), (mapping.to_rgba(values)[:, :3] * light[:, None])[order]
+    axes.add_collection(PolyCollection(faces, facecolors=colors, edgecolors="face", linewidths=0.3, rasterized=True))
     # Axes that shrink to the mesh would mislead the layout, which then cuts their titles off.
     axes.set_aspect("equal", adjustable="datalim")
     axes.autoscale_view()
@@ -363,13 +358,9 @@ def write_witness_plots(
     """
     tree = selection.tree
     views, missing = make_views(tree, folder, meshes, PICTURE_LIMITS, up, selection.orders, selection.families)
-    numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
     common = np.max([view.color_limits for view in views], axis=0) if views and colors == "common" else None
     with drawing(size):
-        figures = {
-            f"witness-{file_stem(numbers[view.label], view.label)}": witness_figure(view, size, common)
-            for view in views
-        }
+        figures = {f"witness-{stem_of(tree, view.label)}": witness_figure(view, size, common) for view in views}
         if len(views) > 1:
             figures["witness"] = _comparison_figure(views, size, None if common is None else common[0])
     return write_figures(figures, output_folder, formats, size), missing

@@ -140,7 +140,7 @@ def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch:
     place, folder = spheres
     refused: list[tuple[str, str, list[float] | None, str]] = [
         ("files/besides", "a.ply", None, "no mesh 'files/besides', did you mean 'files/beside'"),
-        ("nobody", "a.ply", None, "no mesh 'nobody', its labels are such as 'files/"),
+        ("nobody", "a.ply", None, "no mesh 'nobody'; its labels are such as 'files/"),
         ("reference", "a.ply", None, "'reference' is the reference"),
         ("files/beside", "a.stl", None, r"written as \.ply or \.vtp, found '\.stl'"),
         ("files/beside", "a.ply", [-0.5], "below -1/2, found -0.5"),
