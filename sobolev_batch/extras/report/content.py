@@ -25,15 +25,7 @@ from sobolev_batch.extras.leagues.league import (
 )
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, TableRow, counted, study_verdict
-from sobolev_batch.tables.convergence import (
-    CONNECTION_COLUMNS,
-    MESH,
-    page_columns,
-    table,
-    tables_of,
-    unit_notes,
-    with_remarks,
-)
+from sobolev_batch.tables.convergence import CONNECTION_COLUMNS, MESH, page_columns, tables_of, unit_notes, with_remarks
 from sobolev_batch.tables.open import doubts_of, finished_group, open_store, root_attribute, similarity_of
 from sobolev_batch.tables.rendering import Column
 from sobolev_batch.tables.text import minus, number_text, percent
@@ -146,15 +138,15 @@ def _without_nulls(value: Any) -> Any:
 def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     """Return what the template of an open store takes, nothing escaped; InputError where it has no tables yet."""
     meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
-    settings = root_attribute(tree, "study")
+    settings, frames = root_attribute(tree, "study"), tables_of(tree)
     families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
-    frame, study = table(tree), settings["table"]
+    frame, study = frames[""], settings["table"]
     missing = meshes.sel(mesh=meshes["status"] != "complete")
     failed = dict(zip(missing["mesh"].values.tolist(), missing["reason"].values.tolist(), strict=True))
     sentences, rows, omitted = study_verdict(frame, failed)
     orders = frame["order"].drop_duplicates().tolist()
     return {
-        **common_content(study, {"": frame}, status, failed, root_attribute(tree, "versions")),
+        **common_content(study, frames, status, failed, root_attribute(tree, "versions")),
         **cost_content({str(study["study"]["name"]): frame}, families),
         "reference": convergence.attrs["reference"],
         "settings": settings,
@@ -179,9 +171,8 @@ def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence
     longest = int(frame.groupby("order").size().max()) if len(frame) else 0
     rows = with_remarks(frame).groupby("order", sort=False).head(most)
     rows = rows.assign(color=rows["family"].map(families.index), reasons="failed")
-    return PageTable(
-        "convergence", page_columns(tree), rows.to_dict(orient="records"), orders, omitted=max(0, longest - most)
-    )
+    omitted = max(0, longest - most)
+    return PageTable("convergence", page_columns(tree), rows.to_dict(orient="records"), orders, omitted=omitted)
 
 
 def _meshes_table(meshes: xr.Dataset, families: Sequence[str]) -> PageTable:
@@ -266,12 +257,8 @@ def _best(league: League, number: int) -> TableRow:
     """Return the best method of an object, and the next one."""
     values, errors = league.values[number], league.errors[number]
     first, *others = np.argsort(values, kind="stable").tolist()
-    relative = float(np.exp(values[first]))
-    row = {
-        "best": league.methods[first],
-        "relative": relative,
-        "relative_error": relative * float(np.expm1(errors[first])),
-    }
+    relative, error = float(np.exp(values[first])), float(np.expm1(errors[first]))
+    row = {"best": league.methods[first], "relative": relative, "relative_error": relative * error}
     if not others:
         return {**row, "next": "", "ratio": None}
     second = others[0]
