@@ -8,16 +8,8 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.extras.leagues import statistics
 from sobolev_batch.extras.leagues.league import ENDS, RELATIVE, chosen_methods, interval_text, orders_of
-from sobolev_batch.extras.leagues.statistics import (
-    SIGNIFICANCE,
-    adjusted,
-    errors_of_logarithms,
-    interval,
-    least_objects,
-    numbers_of,
-    sign_flip_test,
-)
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
@@ -113,9 +105,9 @@ def compare_studies(
         {"y": name, "order": s, "method": method, **_change(meshes)}
         for (name, s, method), meshes in joined.groupby(["y", "order", "family"], sort=False)
     )
-    result["p"] = result.groupby(["y", "order"], sort=False)["p"].transform(lambda p: adjusted(p.to_numpy()))
+    result["p"] = result.groupby(["y", "order"], sort=False)["p"].transform(lambda p: statistics.adjusted(p.to_numpy()))
     words = np.where(result["ratio"] < 1, "nearer", "farther")
-    result.insert(9, "verdict", np.where(result["p"] < SIGNIFICANCE, words, "undecided"))
+    result.insert(9, "verdict", np.where(result["p"] < statistics.SIGNIFICANCE, words, "undecided"))
     result.attrs["lost"] = tuple(dict.fromkeys(lost))
     return result
 
@@ -148,12 +140,12 @@ def _identity(tree: xr.DataTree) -> str:
 
 
 def _numbers(frame: pd.DataFrame, y: str) -> pd.DataFrame:
-    values, errors = numbers_of(frame, y)
+    values, errors = statistics.numbers_of(frame, y)
     if y == RELATIVE:
         values = np.maximum(values, NEXT_TO_EQUAL)
         # An object that both studies reproduce must not hide what changed for all others.
         errors = np.minimum(errors, values - NEXT_TO_EQUAL)
-    errors = errors_of_logarithms(values, errors)
+    errors = statistics.errors_of_logarithms(values, errors)
     return frame[[*_KEYS, "family"]].assign(value=values, log_error=errors)[np.isfinite(values)]
 
 
@@ -165,8 +157,8 @@ def _change(meshes: pd.DataFrame) -> dict[str, object]:
     return {
         "objects": len(by_object),
         "meshes": len(meshes),
-        **dict(zip(("ratio", *ENDS), np.exp(interval(ratios, errors)), strict=True)),
-        "p": sign_flip_test(ratios, errors),
+        **dict(zip(("ratio", *ENDS), np.exp(statistics.interval(ratios, errors)), strict=True)),
+        "p": statistics.sign_flip_test(ratios, errors),
         "worst": f"{worst['object']}/{worst['mesh']}".lstrip("/"),
         "worst_ratio": float(np.exp(worst["log_ratio"])),
     }
@@ -180,7 +172,7 @@ def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
     ]
     units = "objects" if (changes["objects"] > 1).all() else "meshes"
     notes = wrapped(_NOTE.format(units=units))
-    least = least_objects(changes["method"].nunique())
+    least = statistics.least_objects(changes["method"].nunique())
     if (changes[units] < least).any():
         notes.append(f"With fewer than {least} {units}, the test decides nothing; look at the intervals.")
     notes += [f"{label} is in the old study, and missing in the new one." for label in changes.attrs.get("lost", ())]

@@ -14,23 +14,9 @@ from scipy.sparse.csgraph import connected_components
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, StoreError
+from sobolev_batch.extras.leagues import statistics
 from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of, objects_text
-from sobolev_batch.extras.leagues.statistics import (
-    EDGE_LENGTH,
-    SIGNIFICANCE,
-    Curve,
-    adjusted,
-    common_sizes,
-    errors_of_logarithms,
-    filled,
-    gap_of,
-    interval,
-    least_objects,
-    numbers_of,
-    sign_flip_test,
-    sizes_of,
-    within_objects,
-)
+from sobolev_batch.extras.leagues.statistics import EDGE_LENGTH, Curve
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.norms.columns import NUMBER, VARIABLES
 from sobolev_batch.parameters import as_names, check_choice
@@ -147,7 +133,8 @@ class League:
     def mean_curve(self, method: str) -> tuple[Reals, Reals]:
         """Return sizes (n,), and means over the objects with the ends of their intervals (n, 3), as in the table."""
         i, at_sizes = self.methods.index(method), np.stack([self.values_at, self.errors_at]).transpose(3, 0, 1, 2)
-        means = [interval(values[:, i], errors[:, i], within_objects(values)[i]) for values, errors in at_sizes]
+        spreads = [statistics.within_objects(values)[i] for values, _ in at_sizes]
+        means = list(map(statistics.interval, at_sizes[:, 0, :, i], at_sizes[:, 1, :, i], spreads))
         return np.exp(self.sizes.mean(axis=0)), np.exp(means)
 
     @property
@@ -165,11 +152,11 @@ class League:
         equal sizes, with the ends low and high of its interval; rate, the mean observed order of convergence in the
         edge length, with rate_low and rate_high.
         """
-        spreads = within_objects(self.values)
+        spreads = statistics.within_objects(self.values)
         slopes = [of_method[np.isfinite(of_method[:, 0])] for of_method in self.slopes.swapaxes(0, 1)]
         frame = pd.DataFrame({"method": self.methods, "objects": self.known.sum(axis=0)})
-        frame[[self.y, *ENDS]] = np.exp(list(map(interval, self.values.T, self.errors.T, spreads)))
-        frame[["rate", "rate_low", "rate_high"]] = [interval(*of_method.T) for of_method in slopes]
+        frame[[self.y, *ENDS]] = np.exp(list(map(statistics.interval, self.values.T, self.errors.T, spreads)))
+        frame[["rate", "rate_low", "rate_high"]] = [statistics.interval(*of_method.T) for of_method in slopes]
         frame = frame.sort_values(self.y, kind="stable", ignore_index=True)
         low, high = frame["low"].to_numpy(), frame["high"].to_numpy()
         # Where there are no intervals, any place is possible.
@@ -189,15 +176,17 @@ class League:
         rows = []
         for first, second in combinations(self.methods, 2):
             pairs = [(one[first], one[second]) for one in self.curves.values() if {first, second} <= one.keys()]
-            found = [(*a.at(sizes), *b.at(sizes)) for a, b in pairs if (sizes := common_sizes([a, b])) is not None]
+            found = [
+                (*a.at(sizes), *b.at(sizes)) for a, b in pairs if (sizes := statistics.common_sizes([a, b])) is not None
+            ]
             means = np.reshape(found, (len(found), 4, -1)).mean(axis=2) if found else np.empty((0, 4))
             differences, errors = means[:, 0] - means[:, 2], means[:, 1] + means[:, 3]
-            ratio = np.exp(interval(differences, errors))
-            rows.append([first, second, *ratio, sign_flip_test(differences, errors), len(found)])
+            ratio = np.exp(statistics.interval(differences, errors))
+            rows.append([first, second, *ratio, statistics.sign_flip_test(differences, errors), len(found)])
         frame = pd.DataFrame(rows, columns=["method", "other", "ratio", *ENDS, "p", "objects"])
-        frame["p"] = adjusted(frame["p"].to_numpy(dtype=np.float64))
+        frame["p"] = statistics.adjusted(frame["p"].to_numpy(dtype=np.float64))
         nearer = np.where(frame["ratio"] < 1, frame["method"], frame["other"])
-        frame["nearer"] = np.where(frame["p"] < SIGNIFICANCE, nearer, "")
+        frame["nearer"] = np.where(frame["p"] < statistics.SIGNIFICANCE, nearer, "")
         return frame
 
     def __str__(self) -> str:
@@ -352,8 +341,8 @@ def _league(
         why = {method: f"no {y if y != RELATIVE else 'distance'} of {method}" for method in methods}
         why |= {method: f"{method} reproduced it, up to rounding" for method in found}
         if curves:
-            why |= dict.fromkeys(curves, gap_of(curves))
-        common = common_sizes([*in_common.values()]) if in_common else None
+            why |= dict.fromkeys(curves, statistics.gap_of(curves))
+        common = statistics.common_sizes([*in_common.values()]) if in_common else None
         if common is None or len(in_common) < min(2, len(methods)):
             left_out[name] = "; ".join(dict.fromkeys(why[method] for method in lacking or methods))
             continue
@@ -369,7 +358,7 @@ def _league(
         parts = connected_components(is_known.T.astype(int) @ is_known)[1]
         counts = np.bincount(parts)
         if len(counts) == 1:
-            values = np.stack([filled(at_size) for at_size in values.transpose(2, 0, 1)], axis=2)
+            values = np.stack([statistics.filled(at_size) for at_size in values.transpose(2, 0, 1)], axis=2)
             errors = np.where(np.isnan(errors), np.nanmean(errors, axis=0), errors)
             at_sizes = sizes, values, errors, slopes_of
             return League(order, x, y, tuple(rows), tuple(methods), left_out, of_objects, is_known, *at_sizes)
@@ -393,7 +382,7 @@ def _league(
 def _with_common_sizes(curves: Mapping[str, Curve]) -> dict[str, Curve]:
     """Return the curves of most methods, as far as they have sizes in common: those farthest from the others go."""
     kept = dict(curves)
-    while len(kept) > 2 and common_sizes([*kept.values()]) is None:
+    while len(kept) > 2 and statistics.common_sizes([*kept.values()]) is None:
         middles = {method: (curve.sizes[0] + curve.sizes[-1]) / 2 for method, curve in kept.items()}
         center = float(np.median([*middles.values()]))
         del kept[max(middles, key=lambda method: abs(middles[method] - center))]
@@ -402,12 +391,12 @@ def _with_common_sizes(curves: Mapping[str, Curve]) -> dict[str, Curve]:
 
 def _curves(frame: pd.DataFrame, order: float, x: str, y: str, methods: Sequence[str]) -> dict[str, Curve]:
     """Return the curve at an order of each method that has numbers for an object."""
-    sizes, (values, errors) = sizes_of(frame, x), numbers_of(frame, y)
+    sizes, (values, errors) = statistics.sizes_of(frame, x), statistics.numbers_of(frame, y)
     known = np.flatnonzero((frame["order"].to_numpy() == order) & np.isfinite(sizes) & np.isfinite(values))
     by_size = known[np.argsort(sizes[known], kind="stable")]
     families = frame["family"].to_numpy()[by_size]
     with np.errstate(divide="ignore", invalid="ignore"):
-        numbers = np.stack([np.log(sizes), np.log(values), errors_of_logarithms(values, errors)])[:, by_size]
+        numbers = np.stack([np.log(sizes), np.log(values), statistics.errors_of_logarithms(values, errors)])[:, by_size]
     return {method: Curve(*numbers[:, families == method]) for method in methods if method in families}
 
 
@@ -447,7 +436,7 @@ def pair_lines(league: League) -> list[str]:
             lines.append(f"{row.nearer} {less.format(times(ratio))} {farther} (p = {row.p:.2g}).")
     count, methods = len(league.objects), len(league.table)
     if not lines and methods > 1:
-        least = least_objects(len(league.pairs))
+        least = statistics.least_objects(len(league.pairs))
         few = f"The test cannot tell {methods} methods from chance with {objects_text(count)}; take {least} or more."
         lines.append("No two methods differ beyond chance and error." if count >= least else few)
     return lines
