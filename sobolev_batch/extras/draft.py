@@ -166,18 +166,14 @@ def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[PurePosixPath
     """
     found: list[str] = []
     for parent, folders, files in os.walk(folder):
-        folders[:] = [
-            name for name in folders if not name.startswith(".") and not name.endswith((".zarr", MADE_MESHES))
-        ]
+        shown = (name for name in folders if not name.startswith("."))
+        folders[:] = [name for name in shown if not name.endswith((".zarr", MADE_MESHES))]
         meshes = (Path(parent, name) for name in files if not name.startswith("."))
         found += [path.relative_to(folder).as_posix() for path in meshes if is_mesh_name(path)]
         if len(found) > MOST_MESHES:
             raise StudyError(f"{folder} has more than {MOST_MESHES} mesh files; name a folder with fewer")
-    sizes: dict[PurePosixPath, int] = {}
-    extents: dict[PurePosixPath, Extent] = {}
-    left_out: dict[str, str] = {}
-    names: dict[str, str] = {}
-    left = _MOST_BYTES
+    sizes, extents = dict[PurePosixPath, int](), dict[PurePosixPath, Extent]()
+    left_out, names, left = dict[str, str](), dict[str, str](), _MOST_BYTES
     for below in sorted(found, key=natural_key):
         other = names.setdefault(caseless_key(below), below)
         try:
@@ -218,9 +214,7 @@ def _reference(folder: Path, sizes: Mapping[PurePosixPath, int], left_out: Mappi
             read_mesh(folder / path)
             return path
     examples = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
-    raise StudyError(
-        f"{folder} holds no mesh file that can be read{': ' * bool(examples)}{examples}; name a folder with meshes"
-    )
+    raise StudyError(f"{folder} holds no mesh file that can be read{': ' * bool(examples)}{examples}; name another")
 
 
 def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes") -> str:
@@ -353,10 +347,8 @@ def _one_object(
     path, triangles = str(folder / reference), sizes[reference]
     counts = [count for part in _FRACTIONS if (count := triangles // part) >= _FEWEST_TRIANGLES]
     if not families and not counts:
-        raise StudyError(
-            f"{reference} is the only mesh that can be read, and too small to decimate ({triangles} triangles); add "
-            "meshes to compare with it"
-        )
+        too_small = f"too small to decimate ({triangles} triangles)"
+        raise StudyError(f"{reference} is the only mesh that can be read, and {too_small}; add other meshes")
     remark = "its name says so" if _is_called_reference(reference) else "the mesh with the most triangles"
     sections = [_filled("reference", remark=remark, path=_json(path))]
     summary = [f"reference {path}, {triangles:,} triangles"]
@@ -381,10 +373,8 @@ def _originals(
     path, *others = {str(folder / path).replace(name, OBJECT) for name, path in references.items()}
     counts = [count for part in _FRACTIONS if (count := min(sizes.values()) // part) >= _FEWEST_TRIANGLES]
     if others or not counts:
-        raise StudyError(
-            f"there are originals alone ({few_of([*map(str, references.values())])}), with nothing to compare; add "
-            f"meshes with their names, such as METHOD/{next(iter(references))}_500.ply"
-        )
+        names, example = few_of([*map(str, references.values())]), f"METHOD/{next(iter(references))}_500.ply"
+        raise StudyError(f"there are originals alone ({names}); add meshes with their names, such as {example}")
     summary = f"{_objects_text(references)}, each compared with decimated versions of itself"
     remark = "new files of this kind are objects too"
     return [_filled("reference", remark=remark, path=_json(path)), _filled("decimated", counts=counts)], (summary,)
@@ -401,10 +391,8 @@ def _several_objects(
         for name, method, path in listed
     )
     counts = Counter(method for _, method, _ in listed[len(references) :])
-    return [_filled("objects", meshes=meshes)], (
-        _objects_text(references),
-        *(f"method {method}: {_count(count)}" for method, count in counts.items()),
-    )
+    methods = (f"method {method}: {_count(count)}" for method, count in counts.items())
+    return [_filled("objects", meshes=meshes)], (_objects_text(references), *methods)
 
 
 def _objects_text(names: Iterable[str]) -> str:

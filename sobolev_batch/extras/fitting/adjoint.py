@@ -58,10 +58,8 @@ class MeshTransform:
         period.
         """
         if vertices.shape != (self.count, 3):
-            raise InputError(
-                f"the mesh has {self.count} vertices: pass positions ({self.count}, 3), or "
-                f"{3 * self.count} numbers; found the shape {vertices.shape}"
-            )
+            n = self.count
+            raise InputError(f"the mesh has {n} vertices: pass ({n}, 3) or {3 * n} numbers, found {vertices.shape}")
         coordinates = np.ascontiguousarray((self.of_vertices @ vertices).T)
         if not np.isfinite(coordinates).all():
             raise InputError("positions of vertices must be finite: found NaN or infinity")

@@ -61,9 +61,8 @@ def align(a: MeshLike, b: MeshLike, *, order: float = -2.0) -> Reals:
     radius = meshes[1].bounding_sphere[1]
     centers = [mesh.areas @ np.sum(mesh.corners(), axis=0) / (3 * mesh.area) for mesh in meshes]
     # Around their centers of area, in radii of the second.
-    own, target = (
-        Mesh((mesh.vertices - center) / radius, mesh.triangles) for mesh, center in zip(meshes, centers, strict=True)
-    )
+    pairs = zip(meshes, centers, strict=True)
+    own, target = (Mesh((mesh.vertices - center) / radius, mesh.triangles) for mesh, center in pairs)
     as_is = (centers[0] - centers[1]) / radius
     starts = [(np.eye(3), as_is)] if np.linalg.norm(as_is) <= _IN_PLACE else []
     starts += [(turn, np.zeros(3)) for turn in (*Rotation.create_group("O").as_matrix(), *_of_axes(own, target))]
@@ -74,11 +73,9 @@ def align(a: MeshLike, b: MeshLike, *, order: float = -2.0) -> Reals:
         scored = sorted((stage.lowered(turn, shift, steps) for _, turn, shift in scored), key=lambda found: found[0])
         scored = scored[:kept]
     square, turn, shift = scored[0]
-    if starts[0][1] is as_is and square >= _NO_GAIN * stage.expansion(*starts[0])[0]:
-        return np.eye(4)
     matrix = np.eye(4)
-    matrix[:3, :3] = turn
-    matrix[:3, 3] = centers[1] + radius * shift - turn @ centers[0]
+    if starts[0][1] is not as_is or square < _NO_GAIN * stage.expansion(*starts[0])[0]:
+        matrix[:3, :3], matrix[:3, 3] = turn, centers[1] + radius * shift - turn @ centers[0]
     return matrix
 
 

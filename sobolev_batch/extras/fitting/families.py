@@ -68,20 +68,16 @@ class FitSource(NestedSource):
     def target_member(self, folder: Path) -> Member:
         """Return the member of the target; StudyError where there is none, or several."""
         if self.target is None:
-            raise StudyError(
-                "there is nothing to fit to: in a reference, and where the reference is a member of a family, name a "
-                'target, such as target = { source = "files", paths = ["a.ply"] }'
-            )
+            example = 'target = { source = "files", paths = ["a.ply"] }'
+            raise StudyError(f"there is nothing to fit to: a reference and its family need a target, such as {example}")
         return single_member(self.target, folder)
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each mesh to start from."""
-        target, starts = self.target_member(folder), self.mesh.members(folder)
+        target, settings = self.target_member(folder), self.settings
         return tuple(
-            FittedMember(
-                start.name, start.level, start, target, self.settings, time=start.time, metadata=start.metadata
-            )
-            for start in starts
+            FittedMember(one.name, one.level, one, target, settings, time=one.time, metadata=one.metadata)
+            for one in self.mesh.members(folder)
         )
 
 

@@ -187,19 +187,13 @@ def require_comparable(mesh: Mesh, target: Operand) -> None:
     found = quality_of(target) if isinstance(target, xr.DataArray) else target
     if found is None:
         return
-    ratio = float(mesh.extent.widths.max() / found.extent.widths.max())
-    if not 1 / _OTHER_UNIT < ratio < _OTHER_UNIT:
-        raise InputError(
-            f"the start is {mesh.extent.widths.max():.3g} units wide and the target {found.extent.widths.max():.3g}: "
-            "are both in the same unit of length?"
-        )
+    own, other = (one.extent.widths.max() for one in (mesh, found))
+    if not 1 / _OTHER_UNIT < own / other < _OTHER_UNIT:
+        raise InputError(f"the start is {own:.3g} units wide and the target {other:.3g}: are both in the same unit?")
     (low, high), (other_low, other_high) = mesh.extent.box, found.extent.box
     if np.any(low > other_high) or np.any(other_low > high):
-        corners = ["(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in (low, high, other_low, other_high)]
-        raise InputError(
-            f"the start ({corners[0]} to {corners[1]}) and the target ({corners[2]} to {corners[3]}) do not overlap: "
-            "move one of them to the other first"
-        )
+        a, b, c, d = (f"({', '.join(f'{x:.3g}' for x in corner)})" for corner in (low, high, other_low, other_high))
+        raise InputError(f"the start ({a} to {b}) and the target ({c} to {d}) do not overlap: move one to the other")
 
 
 def welded(mesh: Mesh) -> tuple[Mesh, Indices]:

@@ -139,7 +139,7 @@ def test_meshes_that_changed_or_failed_are_named_and_the_others_written(spheres:
 def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place, folder = spheres
     refused: list[tuple[str, str, list[float] | None, str]] = [
-        ("files/besides", "a.ply", None, "no mesh 'files/besides', did you mean 'files/beside'"),
+        ("files/besides", "a.ply", None, "no mesh 'files/besides'; did you mean 'files/beside'"),
         ("nobody", "a.ply", None, "no mesh 'nobody'; its labels are such as 'files/"),
         ("reference", "a.ply", None, "'reference' is the reference"),
         ("files/beside", "a.stl", None, r"written as \.ply or \.vtp, found '\.stl'"),

@@ -232,9 +232,7 @@ def test_wrong_arguments_are_named(arguments: tuple[sb.Mesh, sb.shapes.Sphere, f
 
 def test_positions_are_checked() -> None:
     squared = sb.fitting.SquaredDistance.for_mesh(sb.shapes.icosphere(0), SPHERE, -2.0, lattice=SMALL)
-    with pytest.raises(
-        sb.errors.InputError, match=r"the mesh has 12 vertices: pass positions \(12, 3\), or 36 numbers"
-    ):
+    with pytest.raises(sb.errors.InputError, match=r"the mesh has 12 vertices: pass \(12, 3\) or 36 numbers"):
         squared(np.zeros((11, 3)))
     with pytest.raises(sb.errors.InputError, match="must be finite: found NaN or infinity"):
         squared(np.full((12, 3), np.nan))
