@@ -78,10 +78,7 @@ class Limit:
         is_relative = order is not None or str(within).rstrip().endswith("%")
         column = (RELATIVE if is_relative else HAUSDORFF) if measure is None else str(measure)
         if column not in _MEASURES and column in VARIABLES:
-            raise InputError(
-                f"{column} cannot be a limit: it is no distance, change or score of a mesh beside its original with "
-                f"bounds or an error; {known_names('', _MEASURES)}"
-            )
+            raise InputError(f"{column} cannot be a limit: it is no distance with bounds; {known_names('', _MEASURES)}")
         if column not in _MEASURES:
             raise InputError(f"no measure is named {quoted(column)}; {known_names(column, _MEASURES)}")
         if order is not None and column != RELATIVE:

@@ -78,10 +78,7 @@ def format_matrix(store: AnyStore, style: Format = "text", orders: Sequence[floa
     chosen = list(dict.fromkeys(distances["order"].values.tolist()))
     count = distances.sizes["mesh"]
     if count > _MOST_MESHES and style not in ("csv", "json"):
-        raise InputError(
-            f"a matrix of {count} meshes is too large to be read as {style}, which goes up to {_MOST_MESHES}: "
-            "take --format csv or json"
-        )
+        raise InputError(f"a matrix of {count} meshes is too large to be read as {style}; take --format csv or json")
     frame = pd.concat([matrix_frame(distances, order) for order in chosen])
     sections = (_section(tree, distances.sel(order=order).load()) for order in chosen)
     notes = [_NOTE]
@@ -105,8 +102,7 @@ def _section(tree: xr.DataTree, distances: xr.Dataset) -> Section:
     ]
     kept = {str(j): labels.index(other) + 1 for j, other in enumerate(others) if any(str(j) in row for row in rows)}
     columns = [Column("label", ""), *(Column(j, str(number)) for j, number in kept.items())]
-    caption = f"Sobolev distances of order {distances['order'].item():g}, {unit}"
-    return Section(caption, [(columns, rows)])
+    return Section(f"Sobolev distances of order {distances['order'].item():g}, {unit}", [(columns, rows)])
 
 
 def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Reals, str]:

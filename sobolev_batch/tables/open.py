@@ -9,7 +9,7 @@ from typing import Any
 
 import xarray as xr
 
-from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
+from sobolev_batch.errors import InputError, StoreError, one_line
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.store import layout
@@ -77,10 +77,7 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
                 # Coordinates are small.
                 tree[group].dataset = tree[group].to_dataset().assign(lazy.data_vars)
         except _MEANINGLESS as error:
-            problem = f"its metadata make no sense: {one_line(error)}"
-            raise DamageError(
-                f"{opened.path}: the store is damaged ({problem}); run the study again", problem
-            ) from error
+            raise opened.damage("the store", f"its metadata make no sense: {one_line(error)}") from error
     if len(numerics := (layout.table_attributes(opened, "convergence") or {}).get(layout.NUMERICS, ())) > 1:
         _log.warning(
             "%s: its fields were computed by numerics of versions %s, as the column numerics of /meshes says; run the "
@@ -130,10 +127,7 @@ def require_unchanged(tree: xr.DataTree) -> None:
     # One that xarray itself has opened says so among its attributes.
     state = tree.encoding.get(_STATE, tree.attrs.get(layout.DIGEST))
     if source is not None and Store.open(source).attributes().get(layout.DIGEST) != state:
-        raise StoreError(
-            f"{source}: a run has changed the store while it was read; once that run has ended, open the store "
-            "again, or give the same command again"
-        )
+        raise StoreError(f"{source}: a run has changed the store while it was read; try again once that run has ended")
 
 
 def location_of(store: AnyStore) -> str | Path | Location:
@@ -141,10 +135,7 @@ def location_of(store: AnyStore) -> str | Path | Location:
     if not isinstance(store, xr.DataTree):
         return store
     if (source := source_of(store)) is None:
-        raise InputError(
-            "the DataTree does not say where it was opened; open it with sobolev_batch.open_store, "
-            "or give the path or URL of the store"
-        )
+        raise InputError("the DataTree does not say where it was opened; open it with open_store, or give its path")
     return source
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.errors import DamageError, InputError
+from sobolev_batch.errors import InputError
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.parameters import as_names
@@ -63,8 +63,7 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     row_of_reference = dict(zip(labels, complete_rows, strict=True)).get(reference, -1)
     keys = spectrum_keys(dict(zip(complete_rows, own_keys, strict=True)), row_of_reference)
     if stale_chunks(store, keys):
-        problem = "they are not those of the stored fields"
-        raise DamageError(f"{store.path}: radial spectra are damaged ({problem}); run the study again", problem)
+        raise store.damage("a radial spectrum", "it is not that of the stored field")
     rows = sorted(keys)
     texts = np.asarray(store.read(QUALITY, rows)).tolist() if rows else []
     qualities = dict(zip(rows, texts, strict=True))

@@ -87,7 +87,7 @@ def compare_studies(
             if "" in stores:
                 as_tree(stores[""])  # It says where there is no store.
         raise InputError(
-            f"the studies have no object in common: the new one has {quoted([*news])}, the old one {quoted([*olds])}"
+            f"the studies share no object: the new one has {quoted([*news])}, the old one {quoted([*olds])}"
         )
     lost = [f"{name} (all of it)" for name in olds if name not in news]
     trees = {name: (as_tree(news[name]), as_tree(olds[name])) for name in common}
@@ -114,10 +114,8 @@ def compare_studies(
 
 def _require_same_reference(name: str, new: xr.DataTree, old: xr.DataTree) -> None:
     if new.attrs["similarity"] != old.attrs["similarity"] or _identity(new) != _identity(old):
-        raise InputError(
-            f"{name or 'the studies'}: they have different references or units of length, so their distances cannot be "
-            "compared; give both the same [reference] and [scaling]"
-        )
+        what = f"{name or 'the studies'}: different references or units of length cannot be compared"
+        raise InputError(f"{what}; give both the same [reference] and [scaling]")
 
 
 def _joined(name: str, new: pd.DataFrame, old: pd.DataFrame, y: str, lost: list[str]) -> pd.DataFrame:

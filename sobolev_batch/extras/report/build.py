@@ -114,10 +114,8 @@ def make_report(
         require_unchanged(tree)
         return page
     if witnesses:
-        raise InputError(
-            f"{objects.location}: meshes are shown in the report of one object, such as "
-            f"{objects.location.below(objects.names[0])}"
-        )
+        one = objects.location.below(objects.names[0])
+        raise InputError(f"{objects.location}: meshes are shown in the report of one object, such as {one}")
     content = league_content(objects, status(store))
     charts = league_data(content["leagues"], content["name"], content["orders"])
     families = content["costs"][0].methods if content["costs"] else charts["families"]

@@ -157,7 +157,7 @@ def test_the_reference_is_handed_down_to_nested_sources() -> None:
 
 def test_a_mesh_that_cannot_be_fitted_is_named() -> None:
     (member,) = members({**FIT, "mesh": {**STARTS, "levels": [1]}, "target": {"source": "sphere"}})
-    with pytest.raises(sb.errors.MeshError, match=r"1 cannot be fitted to sphere: .*the same unit of length"):
+    with pytest.raises(sb.errors.MeshError, match=r"1 cannot be fitted to sphere: .*both in the same unit"):
         member.load()
     (closed_form,) = members({**FIT, "mesh": {"source": "sphere"}, "target": SPHERE})
     with pytest.raises(sb.errors.MeshError, match="is no mesh; its triangles are needed"):
