@@ -156,8 +156,7 @@ class CompareOptions:
         """Rigid motion (4, 4) that brings A nearest to B; None if not asked for."""
         if not self.align:
             return None
-        align = extra(FEATURES, "align", "--align")
-        return np.asarray(align(*self.meshes, order=self.chosen_orders[0]))
+        return np.asarray(extra(FEATURES, "align", "--align")(*self.meshes, order=self.chosen_orders[0]))
 
     @property
     def names(self) -> tuple[str, str]:
@@ -285,8 +284,7 @@ class Comparison:
         rtol, by_order = self.options.accuracy["rtol"], self._by_order
         if self.deviations is not None:
             largest = deviation_text(self.deviations.both, self.unit)
-            both = " and ".join(self.options.names)
-            yield f"The largest deviation of {both} from each other is {largest}."
+            yield f"The largest deviation of {' and '.join(self.options.names)} from each other is {largest}."
         if self.options.motion is not None and self.before is not None:
             relative, error = (self.before[name].item() for name in ("relative", "relative_error"))
             yield f"where it is in the file: {percent(relative, error)}"
@@ -306,10 +304,8 @@ class Comparison:
         """Parts of the errors, and the settings that were chosen."""
         for result in self._by_order:
             if result["distance"] > 0:
-                by_part = result["error_part"].to_series()
-                parts = ", ".join(
-                    f"{name} {part:.0e}" for name, part in by_part.items() if name != "statistical" or part
-                )
+                by_part = result["error_part"].to_series().items()
+                parts = ", ".join(f"{name} {part:.0e}" for name, part in by_part if name != "statistical" or part)
                 distance_text = with_error(result["distance"].item(), result["error"].item())
                 yield f"order {result['order'].item():g}: distance {distance_text} ({parts})"
         if self.options.accuracy["rtol"] is not None and "M" in self.results.attrs:

@@ -151,8 +151,7 @@ def info_command(context: click.Context, files: tuple[Path, ...], style: str) ->
     """
     from sobolev_batch.geometry.formats.readers import read_mesh
 
-    facts: list[dict[str, Any]] = []
-    refused: list[MeshError] = []
+    facts, refused = list[dict[str, Any]](), list[MeshError]()
     for path in files:
         try:
             facts.append(_facts(path, read_mesh(path)))

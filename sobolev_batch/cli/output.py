@@ -129,9 +129,8 @@ def show_usage_error(error: click.ClickException) -> None:
     text = StringIO()
     error.show(text)
     worded = text.getvalue().removesuffix("\n").replace("Error: ", "error: ", 1)
-    shown = worded.replace(error.message, visible(error.message))
     # Click sets lists of choices off by tabulators.
-    echo_lines(shown.expandtabs(2), err=True)
+    echo_lines(worded.replace(error.message, visible(error.message)).expandtabs(2), err=True)
 
 
 def replace_line(text: str, before: str) -> str:

@@ -246,11 +246,9 @@ def plot_command(
     figures = {}
     with drawing(panel):
         with suppress(InputError):
-            by_cost = league(store, orders, by="cost", methods=chosen)
-            figures["league-by-cost"] = COST_LEAGUE.figure(by_cost, size=panel)
+            figures["league-by-cost"] = COST_LEAGUE.figure(league(store, orders, by="cost", methods=chosen), size=panel)
         try:
-            by_size = league(store, orders, x=x, methods=chosen)
-            figures["league"] = LEAGUE.figure(by_size, size=panel)
+            figures["league"] = LEAGUE.figure(league(store, orders, x=x, methods=chosen), size=panel)
         except InputError as error:
             if x or not figures:
                 raise
@@ -354,9 +352,7 @@ def export_command(store: Location, output: Path, style: ExportFormat | None, or
 
     style = style or BY_ENDING.get(output.suffix.lower())
     if style is None:
-        raise click.UsageError(
-            f"no format has the ending {output.suffix!r}; choose one by --format parquet, netcdf or csv"
-        )
+        raise click.UsageError(f"no format has the ending {output.suffix!r}; give --format parquet, netcdf or csv")
     if orders and style == "netcdf":
         raise click.UsageError("--order is for parquet and csv; netcdf has the orders of the study")
     export(store, output, style, orders)
@@ -442,8 +438,7 @@ def league_command(
         is_worse |= len(larger) > 0
         text = format_changes(changes, style)
     elif by == "cost":
-        by_cost = league(store, orders, by="cost", x=x, methods=families or None)
-        text = format_cost_leagues(by_cost, style)
+        text = format_cost_leagues(league(store, orders, by="cost", x=x, methods=families or None), style)
     else:
         by_size = [league(store, orders, x=x, y=y, methods=families or None) for y in columns]
         text = format_league([one for leagues in by_size for one in leagues], style)

@@ -294,8 +294,7 @@ def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosix
     counts, names = Counter(wanted), dict[str, str]()
     for (name, path, _), parts, family in zip(owned, folders, wanted, strict=True):
         # Meshes of one object that are alone, in no folder of their own, are a family together.
-        is_alone = not name and not parts[shared:] and counts[family] == 1
-        family = "" if is_alone else family
+        family = "" if not name and not parts[shared:] and counts[family] == 1 else family
         if family not in names:
             names[family] = _free_name(family, names.values())
         families.setdefault((name, names[family]), []).append(path)

@@ -224,8 +224,7 @@ class Evaluator:
         """Return the tails (orders, rows), from spectra and from a function of a row and its energies in octaves."""
         if self.sampling is None:
             return None
-        energies = self.axis.energies(spectra)
-        found = [remainder(row, of_row) for row, of_row in zip(rows, energies, strict=True)]
+        found = [remainder(row, energies) for row, energies in zip(rows, self.axis.energies(spectra), strict=True)]
         return Tail(*self.axis.octave_integrals(spectra, self.orders), *np.moveaxis(np.array(found), 0, -1))
 
     def only(self, rows: Iterable[int]) -> Self:

@@ -90,8 +90,7 @@ def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
     gone = [shortened(name) for name in frame["family"].drop_duplicates() if name not in set(drawn["family"])]
     families = f"families not drawn: {few_of(gone)}" if gone else ""
     set_title(axes, f"order {order:g}", _absent(frame, selection.x), families)
-    label = escaped(label_of(selection.x, study_unit(selection.tree)))
-    axes.set(xlabel=label, ylabel="relative Sobolev distance")
+    axes.set(xlabel=escaped(label_of(selection.x, study_unit(selection.tree))), ylabel="relative Sobolev distance")
 
 
 def draw_rates(found: xr.Dataset, order: float | None, axes: Axes) -> None:

@@ -149,8 +149,7 @@ def exported(
     By default these are all computed meshes with triangles but the reference, and the orders of the study.
     """
     tree = as_tree(store)
-    of_study = finished_group(tree, "convergence")["order"].values.tolist()
-    orders = check_orders(of_study if order is None else order)
+    orders = check_orders(finished_group(tree, "convergence")["order"].values.tolist() if order is None else order)
     made, reference = StudyMeshes.from_tree(tree, folder), reference_of(tree)
     status = made.table["status"].sel(mesh=reference).item()
     if status != "complete":

@@ -104,8 +104,7 @@ def format_evolution(
         caption = f"Sobolev distance of order {order:g} to {reference_of(tree)} over time, in % of its norm"
         moments = [f"{name}: {_moment(rows, factor)}" for name, rows in families.items()]
         sections.append(Section(caption, [(table, cells)], moments))
-    notes = wrapped(_NOTE.format(factor=factor))
-    return rendered(style, frame[["order", "family", "time", *columns]], sections, notes)
+    return rendered(style, frame[["order", "family", "time", *columns]], sections, wrapped(_NOTE.format(factor=factor)))
 
 
 def has_times(tree: xr.DataTree) -> bool:
