@@ -143,25 +143,21 @@ def _set_up_logging(debug: bool) -> None:
         handlers=[EchoHandler()],
     )
     for handler in logging.root.handlers:
-        handler.addFilter(_with_kind)
-        if not debug:
-            # Not by the level of its logger, which the cluster sets itself when it is imported.
-            handler.addFilter(_is_shown)
+        # Not by the level of its logger, which the cluster sets itself when it is imported.
+        handler.addFilter(lambda record: _is_shown(record, debug=debug))
     if debug:
         # At debug level they log requests with their signatures and session tokens.
         for driver in _DRIVERS:
             logging.getLogger(driver).setLevel(logging.INFO)
 
 
-def _with_kind(record: logging.LogRecord) -> bool:
-    """Add the level of a message as commands print it."""
+def _is_shown(record: logging.LogRecord, *, debug: bool) -> bool:
+    """Add the level of a message as commands print it, and return whether it is shown.
+
+    Those of the cluster at its start and end would only hide the table.
+    """
     record.kind = record.levelname.lower()
-    return True
-
-
-def _is_shown(record: logging.LogRecord) -> bool:
-    """Return whether a message is for users: those of the cluster at its start and end would only hide the table."""
-    if not record.name.startswith("distributed"):
+    if debug or not record.name.startswith("distributed"):
         return True
     # They show Dask's own code, and the error that follows says what happened.
     record.exc_info = record.exc_text = None
