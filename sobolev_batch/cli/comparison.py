@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -197,6 +197,7 @@ class Comparison:
         deviations: Largest deviations in this unit; None if it has no name and `proximity` was not asked for.
         before: The distance before A was moved; None if that was not asked for.
         doubt: Question whether both are in one unit and place; None where they look it.
+        remarks: Reasons to doubt the comparison, this one too.
     """
 
     options: CompareOptions
@@ -208,6 +209,7 @@ class Comparison:
     deviations: Deviations | None
     before: xr.Dataset | None
     doubt: str | None
+    remarks: Sequence[str]
 
     @classmethod
     def of_files(cls, options: CompareOptions) -> Comparison:
@@ -223,7 +225,8 @@ class Comparison:
             first = _moved(first, options.motion)
         pair = similarity.apply(first), similarity.apply(second)
         doubt = placement_doubt(*(surface.extent for surface in pair))
-        for line in _remarks(options, first, second, doubt):
+        remarks = tuple(_remarks(options, first, second, doubt))
+        for line in remarks:
             echo(f"note: {line}", err=True)
         # Bad settings are refused before a long computation.
         nearness, deviations = None, None
@@ -233,7 +236,7 @@ class Comparison:
         elif options.unit is not None:
             deviations = largest_deviation(first, second)
         results = yardsticks(*pair, orders, **accuracy, on_progress=show_step)
-        return cls(options, first, second, similarity, results, nearness, deviations, before, doubt)
+        return cls(options, first, second, similarity, results, nearness, deviations, before, doubt, remarks)
 
     @property
     def area_change(self) -> float:
@@ -317,11 +320,6 @@ class Comparison:
             else f"Sobolev distances are in radii of {self.options.names[1]}, {radius:.6g} {self.unit} each "
             f"(scale {self.similarity.scale:.6g}, origin {origin})"
         )
-
-    @property
-    def remarks(self) -> Iterator[str]:
-        """Reasons to doubt the comparison."""
-        return _remarks(self.options, self.first, self.second, self.doubt)
 
     @property
     def rows(self) -> list[list[str]]:

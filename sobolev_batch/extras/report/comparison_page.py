@@ -88,7 +88,7 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
         "is_cut": length < largest.lower,
         "distances": PageTable("distances", columns, rows, is_sortable=False),
         "details": list(comparison.details),
-        "remarks": list(comparison.remarks),
+        "remarks": comparison.remarks,
         "omissions": [],
     }
     write_file(path, filled("comparison", content, charts)[0].encode(), "the report")
