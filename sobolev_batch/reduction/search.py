@@ -125,7 +125,10 @@ class Search:
         within = [one for one in trials if one.is_within]
         best = min(within, key=lambda one: (one.triangles, -sign * one.size), default=None)
         ordered = sorted(trials, key=lambda one: sign * one.size)
-        others = [one for one in _told(ordered) if not one.is_within]
+        beside = zip([None, *ordered], ordered, [*ordered[1:], None], strict=False)
+        # Those that failed alone do not say where the limit is met, but where none is coarser.
+        told = [one for finer, one, coarser in beside if coarser is None or not _is_only_failure(finer, one, coarser)]
+        others = [one for one in told if not one.is_within]
         coarser = (one for one in others if best is None or sign * one.size > sign * best.size)
         made = [one for one in ordered if one.triangles]
         return Bracket(best, next(coarser, None), all(a.lower <= b.upper for a, b in combinations(made, 2)))
@@ -226,12 +229,6 @@ class Search:
 def _is_only_failure(finer: Trial | None, trial: Trial, coarser: Trial | None) -> bool:
     """Tell whether a trial failed, and those beside it that were made, if any, did not."""
     return not trial.has_distance and all(one is None or one.has_distance for one in (finer, coarser))
-
-
-def _told(ordered: Sequence[Trial]) -> list[Trial]:
-    """Return trials that say where the limit is met: those that failed alone do not, but where none is coarser."""
-    beside = zip([None, *ordered], ordered, [*ordered[1:], None], strict=False)
-    return [one for finer, one, coarser in beside if coarser is None or not _is_only_failure(finer, one, coarser)]
 
 
 def _extrapolated(points: Mapping[float, float], end: float) -> float:

@@ -17,15 +17,7 @@ from sobolev_batch.reduction.remesher import Remesher, searched_parameter
 from sobolev_batch.sources.files import number_as_text
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.programs import Cost
-from sobolev_batch.sources.registry import (
-    ExpectedSize,
-    Fingerprint,
-    KeepingSource,
-    Member,
-    Several,
-    Source,
-    single_member,
-)
+from sobolev_batch.sources.registry import ExpectedSize, KeepingSource, Member, Several, Source, single_member
 
 # One or several tolerances, as a study file gives them; and the parameter that is searched, with its ends.
 Tolerances = Annotated[
@@ -138,7 +130,7 @@ class SearchedMember(Member):
             return self.search.recorded()
         return None
 
-    def fingerprint(self) -> Fingerprint:
+    def fingerprint(self) -> dict[str, str]:
         """Return the digest of the search."""
         return {"search": self.search.digest}
 

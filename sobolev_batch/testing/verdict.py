@@ -72,11 +72,9 @@ class Verdict(Shown):
         return (self.upper - self.lower) / 2
 
     def __bool__(self) -> bool:
-        """Tell whether the surfaces are the same."""
         return self.outcome == "same"
 
     def __str__(self) -> str:
-        """Return the verdict in one line."""
         number = f"relative distance {self._number} at order {self.order:g}"
         change = 100 * self.area_change
         area = f"area {change:+,.0f} %" if abs(change) >= _WHOLE else f"area {change:+.2g} %"

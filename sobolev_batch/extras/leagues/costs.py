@@ -84,7 +84,6 @@ class CostLeague:
         return frame.sort_values("front", ascending=False, kind="stable", ignore_index=True)
 
     def _best(self, meshes: pd.DataFrame) -> str:
-        """Return the members of a method that are on fronts, those on the most first."""
         fronts = meshes[meshes["front"]].groupby("member", sort=False).size()
         fronts = fronts.sort_values(ascending=False, kind="stable")
         shown = [f"{name} ({n})" if len(self.objects) > 1 else str(name) for name, n in fronts.items()]
