@@ -87,11 +87,8 @@ class NamedCommands(click.Group):
             formatter.write_dl(rows)
 
     def _registered(self) -> dict[str, EntryPoint]:
-        points = {
-            point.name.removeprefix(self.prefix): point
-            for point in reversed(registered(COMMANDS))
-            if point.name.startswith(self.prefix)
-        }
+        own = (point for point in reversed(registered(COMMANDS)) if point.name.startswith(self.prefix))
+        points = {point.name.removeprefix(self.prefix): point for point in own}
         # Names of several words are those of commands of groups.
         return {name: point for name, point in points.items() if " " not in name}
 

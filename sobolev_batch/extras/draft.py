@@ -274,10 +274,7 @@ def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosix
     """Return the files of each object and family, which is that of their folder or of their name."""
     owned = _owned(paths, references)
     # Objects and sizes have folders of their own, which say nothing of families.
-    own = {
-        name: {*map(caseless_key, (name, *(reference.parent.parts if name else ())))}
-        for name, reference in references.items()
-    }
+    own = {name: {*map(caseless_key, (name, *(one.parent.parts if name else ())))} for name, one in references.items()}
     folders = [
         [part for part in path.parent.parts if not _SIZE.fullmatch(part) and caseless_key(part) not in own[name]]
         for name, path, _ in owned

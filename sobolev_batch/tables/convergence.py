@@ -55,24 +55,20 @@ _MADE = tuple(item.name for item in fields(Cost))
 # What the rows of all objects have besides.
 _OF_ALL = ("object", "reference", "unit_length")
 _NOTE = """\
-Relative distances are fractions of the reference's norm. Errors are meant as bounds,
-the sums of truncation (frequencies beyond the highest one), aliasing (spacing of the
-lattice), discretisation (quadrature and NUFFT) and chance (random frequencies, if the
-study samples octaves). A distance marked * is not larger than its error, and gives no
-rate. The column "area" is the share of the squared distance that a change of total area
-alone explains."""
+Relative distances are fractions of the reference's norm. Errors are meant as bounds, the sums of truncation
+(frequencies beyond the highest one), aliasing (spacing of the lattice), discretisation (quadrature and NUFFT) and
+chance (random frequencies, if the study samples octaves). A distance marked * is not larger than its error, and gives
+no rate. The column "area" is the share of the squared distance that a change of total area alone explains."""
 _UNIT_NOTE = """\
 Edges and other lengths are in {}.
 Sobolev distances are computed in {}."""
 _PROXIMITY_NOTE = """\
-Other distances are the same at all orders. They are those of points to the other mesh, the
-larger of both directions. The Hausdorff distance is between the bounds; other numbers are
-those of sampled points, with standard errors. The bias is the mean distance of points of
-the mesh, positive outside of the reference and negative inside. Chamfer is the sum of the mean distances of
-both directions. Normals are compared as lines."""
+Other distances are the same at all orders. They are those of points to the other mesh, the larger of both directions.
+The Hausdorff distance is between the bounds; other numbers are those of sampled points, with standard errors. The bias
+is the mean distance of points of the mesh, positive outside of the reference and negative inside. Chamfer is the sum of
+the mean distances of both directions. Normals are compared as lines."""
 _ACCURACY_NOTE = """\
-The study requests an error of at most {rtol:g} of each distance; a distance
-marked ! has a larger one."""
+The study requests an error of at most {rtol:g} of each distance; a distance marked ! has a larger one."""
 
 MESH = Column("mesh", "mesh", kind="label")
 TRIANGLES = Column("triangles", "triangles", count)

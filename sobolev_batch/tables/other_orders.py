@@ -79,9 +79,7 @@ def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = Non
     """
     stored = finished_group(tree, "convergence", load=False)
     accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
-    return _at_orders(
-        tree, stored, order, lambda others: _computed(tree, others, meshes).convergence_table(accuracy)
-    ).load()
+    return _at_orders(tree, stored, order, lambda new: _computed(tree, new, meshes).convergence_table(accuracy)).load()
 
 
 def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
@@ -90,8 +88,8 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     labels = meshes["mesh"].values
     stored = finished_group(tree, "distances", load=False).drop_vars("key", errors="ignore").sel(mesh=labels)
     if stored.sizes["other"] != stored.sizes["mesh"]:
-        return _at_orders(tree, stored, order, lambda others: _computed(tree, others).distances_table())
-    return _at_orders(tree, stored.sel(other=labels), order, lambda others: _pairs_at(tree, meshes, others))
+        return _at_orders(tree, stored, order, lambda new: _computed(tree, new).distances_table())
+    return _at_orders(tree, stored.sel(other=labels), order, lambda new: _pairs_at(tree, meshes, new))
 
 
 def _pairs_at(tree: xr.DataTree, meshes: xr.Dataset, others: tuple[float, ...]) -> xr.Dataset:
@@ -104,7 +102,7 @@ def _pairs_at(tree: xr.DataTree, meshes: xr.Dataset, others: tuple[float, ...]) 
 def norms_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
     """Return the norms of an open store's meshes at some orders, in memory; see `convergence_at`."""
     stored = finished_group(tree, "norms", load=False)
-    return _at_orders(tree, stored, order, lambda others: _computed(tree, others, meshes).norms_table()).load()
+    return _at_orders(tree, stored, order, lambda new: _computed(tree, new, meshes).norms_table()).load()
 
 
 def require_fields(tree: xr.DataTree, table: xr.Dataset, meshes: Sequence[str]) -> None:

@@ -200,9 +200,7 @@ def latex_powers(text: str) -> str:
     >>> latex_powers("1.2 × 10⁻⁵ %")
     '1.2 $\\times 10^{-5}$ %'
     """
-    return re.sub(
-        rf"{POWER.strip()}([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", lambda found: rf"$\times 10^{{{found[1].translate(_PLAIN)}}}$", text
-    )
+    return re.sub(rf"{POWER.strip()}([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", lambda one: rf"$\times 10^{{{one[1].translate(_PLAIN)}}}$", text)
 
 
 def _escaped(text: str, style: Format) -> str:

@@ -162,7 +162,7 @@ def test_a_fit_that_is_asked_to_end_writes_the_best_so_far(folder: Path, request
 REFUSED = [
     (f"plot {STORE} --output study.toml", "study.toml: no files can be written there"),
     (f"plot {STORE} --output none --family co*", "no family 'co*', only ico, reference"),
-    (f"plot {STORE} --output none --mesh ico/11", "no mesh 'ico/11', did you mean 'ico/1'?"),
+    (f"plot {STORE} --output none --mesh ico/11", "no mesh 'ico/11'; did you mean 'ico/1'?"),
     (f"witness {STORE} --mesh scan*", "matches 'scan*'"),
     (f"witness {STORE} --output study.toml", "study.toml: no files can be written there"),
     (f"report {STORE} --mesh r*", "matches 'r*'; its labels are such as 'ico/0', 'ico/1'"),

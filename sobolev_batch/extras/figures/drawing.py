@@ -335,10 +335,7 @@ def write_plots(
 ) -> tuple[tuple[Path, ...], Mapping[str, Sequence[str]]]:
     """Write each kind of `plot` with results into a folder; return the paths, and what each leaves out, by name."""
     with drawing(size):
-        figures = {
-            name: kind.figure(selection, items, size)
-            for name, kind in PLOTS.items()
-            if (items := kind.items(selection))
-        }
+        of_kinds = {name: kind.items(selection) for name, kind in PLOTS.items()}
+        figures = {name: PLOTS[name].figure(selection, items, size) for name, items in of_kinds.items() if items}
     notes = {name: notes_of(figure) for name, figure in figures.items()}
     return write_figures(figures, folder, formats, size), {name: lines for name, lines in notes.items() if lines}

@@ -85,17 +85,13 @@ class Selection:
             of_reference = fields.sel(mesh=reference).load()
             found = [spectrum(fields.sel(mesh=label), of_reference, orders) for label in labels]
             found = [bands.assign(energy_error=xr.zeros_like(bands["energy"])) for bands in found]
-        along = pd.Index(labels, name="mesh")
-        spectra = xr.concat(
-            [bands[["share", "energy", "energy_error"]] for bands in found], along, coords="minimal", compat="override"
-        ).drop_attrs()
+        along, parts = pd.Index(labels, name="mesh"), [bands[["share", "energy", "energy_error"]] for bands in found]
+        spectra = xr.concat(parts, along, coords="minimal", compat="override").drop_attrs()
         areas = finished_group(tree, "meshes")["area"].reset_coords(drop=True)
         limits = 2 * (areas.sel(mesh=labels) + areas.sel(mesh=reference, drop=True))
         longest, shortest = (spectra[f"{name}_wavelength"].to_numpy() for name in ("longest", "shortest"))
-        texts = [
-            f"> {short:.3g}" if np.isinf(long) else f"{long:.3g} – {short:.3g}"
-            for long, short in zip(longest, shortest, strict=True)
-        ]
+        ends = zip(longest, shortest, strict=True)
+        texts = [f"> {short:.3g}" if np.isinf(long) else f"{long:.3g} – {short:.3g}" for long, short in ends]
         return spectra.assign(
             energy=spectra["energy"] / limits,
             energy_error=spectra["energy_error"] / limits,

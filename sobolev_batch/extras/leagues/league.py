@@ -16,7 +16,7 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.extras.leagues import statistics
 from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of, objects_text
-from sobolev_batch.extras.leagues.statistics import EDGE_LENGTH, Curve
+from sobolev_batch.extras.leagues.statistics import EDGE_LENGTH, Curve, common_sizes
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.norms.columns import NUMBER, VARIABLES
 from sobolev_batch.parameters import as_names, check_choice
@@ -30,12 +30,10 @@ from sobolev_batch.tables.text import number_text, times, wrapped
 from sobolev_batch.transform.lattice import Orders
 
 LEAGUE_NOTE = """\
-Numbers ({y}) are geometric means over the objects, at equal {x}. Their 95 % intervals tell
-how methods compare: they hold the errors of the numbers, and not that some objects are harder
-than others. A rank such as 1-3 says which places the intervals allow. Rates are slopes over
-the edge length. Two methods differ where the permutation test of pairs says so, at the level
-of 5 % for all pairs together. Pairs are compared at the sizes and over the objects that both
-have."""
+Numbers ({y}) are geometric means over the objects, at equal {x}. Their 95 % intervals tell how methods compare: they
+hold the errors of the numbers, and not that some objects are harder than others. A rank such as 1-3 says which places
+the intervals allow. Rates are slopes over the edge length. Two methods differ where the permutation test of pairs says
+so, at the level of 5 % for all pairs together. Pairs are compared at the sizes and over the objects that both have."""
 
 # What methods are compared by unless another number is named.
 RELATIVE = "relative"
@@ -176,9 +174,7 @@ class League:
         rows = []
         for first, second in combinations(self.methods, 2):
             pairs = [(one[first], one[second]) for one in self.curves.values() if {first, second} <= one.keys()]
-            found = [
-                (*a.at(sizes), *b.at(sizes)) for a, b in pairs if (sizes := statistics.common_sizes([a, b])) is not None
-            ]
+            found = [(*a.at(sizes), *b.at(sizes)) for a, b in pairs if (sizes := common_sizes([a, b])) is not None]
             means = np.reshape(found, (len(found), 4, -1)).mean(axis=2) if found else np.empty((0, 4))
             differences, errors = means[:, 0] - means[:, 2], means[:, 1] + means[:, 3]
             ratio = np.exp(statistics.interval(differences, errors))
@@ -342,7 +338,7 @@ def _league(
         why |= {method: f"{method} reproduced it, up to rounding" for method in found}
         if curves:
             why |= dict.fromkeys(curves, statistics.gap_of(curves))
-        common = statistics.common_sizes([*in_common.values()]) if in_common else None
+        common = common_sizes([*in_common.values()]) if in_common else None
         if common is None or len(in_common) < min(2, len(methods)):
             left_out[name] = "; ".join(dict.fromkeys(why[method] for method in lacking or methods))
             continue
@@ -382,7 +378,7 @@ def _league(
 def _with_common_sizes(curves: Mapping[str, Curve]) -> dict[str, Curve]:
     """Return the curves of most methods, as far as they have sizes in common: those farthest from the others go."""
     kept = dict(curves)
-    while len(kept) > 2 and statistics.common_sizes([*kept.values()]) is None:
+    while len(kept) > 2 and common_sizes([*kept.values()]) is None:
         middles = {method: (curve.sizes[0] + curve.sizes[-1]) / 2 for method, curve in kept.items()}
         center = float(np.median([*middles.values()]))
         del kept[max(middles, key=lambda method: abs(middles[method] - center))]

@@ -59,9 +59,7 @@ _OBJECT_COLUMNS = (
     Column("above_rtol", "above rtol", "{:,}".format),
 )
 # The relative distance comes first: a narrow screen shows no more without scrolling.
-_LEAGUE_COLUMNS = tuple(
-    sorted(league_columns(RELATIVE), key=lambda column: (column.kind != "label", column.name != "relative"))
-)
+_LEAGUE_COLUMNS = tuple(sorted(league_columns(RELATIVE), key=lambda one: (one.kind != "label", one.name != RELATIVE)))
 
 
 @dataclass(frozen=True)
@@ -89,9 +87,7 @@ class PageTable:
         """Each order, its text and its rows."""
         if self.orders is None:
             return [(None, "", list(self.rows))]
-        return [
-            (order, minus(f"{order:g}"), [row for row in self.rows if row["order"] == order]) for order in self.orders
-        ]
+        return [(s, minus(f"{s:g}"), [row for row in self.rows if row["order"] == s]) for s in self.orders]
 
 
 def reasons_table(name: str, reasons: Mapping[str, str]) -> PageTable | None:
