@@ -431,11 +431,10 @@ def league_command(
         raise click.UsageError("--against compares meshes of the same names: leave out --by and --x")
     if against is not None:
         changes = compare_studies(store, against, orders, y=columns, methods=families or None)
-        is_worse = bool(changes.attrs["lost"]) or (changes["verdict"] == "farther").any()
         larger = changes[changes["ratio"] > (math.inf if most is None else most)]
         for row in larger.to_dict("records"):
             echo(f"{row['method']}: {row['y']} grew {row['ratio']:.3g} times in the mean, above {most:g}", err=True)
-        is_worse |= len(larger) > 0
+        is_worse = bool(changes.attrs["lost"]) or (changes["verdict"] == "farther").any() or len(larger) > 0
         text = format_changes(changes, style)
     elif by == "cost":
         text = format_cost_leagues(league(store, orders, by="cost", x=x, methods=families or None), style)

@@ -337,7 +337,7 @@ def draw_witness(view: MeshView, axes: Axes | None = None, limit: float | None =
     limit = view.color_limits[0] if limit is None else limit
     draw_mesh(axes, view, limit=limit)
     set_title(axes, escaped(view.label), _seen(view))
-    _add_colorbar(axes.figure, axes, [view], limit, 0)  # type: ignore[arg-type]
+    _add_colorbar(axes, [view], limit, 0)
     return axes
 
 
@@ -374,7 +374,7 @@ def witness_figure(view: MeshView, size: Size | None = None, limits: Reals | Non
     figure, panels = _panels(count, size, above=0.3, beside=0.8)
     for i, axes in enumerate(panels):
         draw_mesh(axes, view, i, limits[i])
-        _add_colorbar(figure, axes, [view], limits[i], i)
+        _add_colorbar(axes, [view], limits[i], i)
     omission = f"{count} of {len(view.orders)} orders" if count < len(view.orders) else ""
     figure.suptitle("\n".join(filter(None, (escaped(view.label), _seen(view), omission))), fontsize="medium")
     return figure
@@ -409,11 +409,11 @@ def _comparison_figure(views: Sequence[MeshView], size: Size | None, limit: floa
         draw_mesh(axes, replace(view, eye=FRONT), limit=limit)
         axes.set_title(f"{shortened(view.label)}\n{view.original_triangles:,} triangles", fontsize="small")
         if limit is None:
-            _add_colorbar(figure, axes, [view], view.color_limits[0], 0)
+            _add_colorbar(axes, [view], view.color_limits[0], 0)
     if omission:
         figure.suptitle(omission, fontsize="medium")
     if limit is not None:
-        _add_colorbar(figure, panels, shown, limit, 0)
+        _add_colorbar(panels, shown, limit, 0)
     return figure
 
 
@@ -446,17 +446,15 @@ def write_difference_picture(
             for axes in in_row:
                 axes.update_datalim(Bbox.union([axes.dataLim for axes in in_row]).corners())
                 axes.autoscale_view()
-            _add_colorbar(figure, in_row, row, strongest.color_limits[0], 0)
+            _add_colorbar(in_row, row, strongest.color_limits[0], 0)
     return write_figures({path.stem: figure}, path.parent, [path.suffix[1:]], None)  # type: ignore[list-item]
 
 
-def _add_colorbar(
-    figure: Figure, panels: Axes | Sequence[Axes], views: Sequence[MeshView], limit: float, index: int
-) -> None:
+def _add_colorbar(panels: Axes | Sequence[Axes], views: Sequence[MeshView], limit: float, index: int) -> None:
     """Add the colours of some meshes at one of their orders, with arrows where values lie beyond them."""
     values, unit = np.concatenate([view.values[index] for view in views]), views[0].unit
     ends = bool(values.min() < -limit), bool(values.max() > limit)
-    bar = figure.colorbar(
+    bar = (panels if isinstance(panels, Axes) else panels[0]).figure.colorbar(
         _mapping(views[0], limit),
         ax=panels,
         shrink=0.8,

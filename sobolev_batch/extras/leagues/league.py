@@ -319,16 +319,11 @@ def chosen_methods(frames: Iterable[pd.DataFrame], methods: str | Sequence[str] 
 
 
 def _league(
-    tables: Mapping[str, pd.DataFrame],
-    order: float,
-    x: str,
-    y: str,
-    methods: Sequence[str],
-    unfinished: Mapping[str, str],
+    tables: Mapping[str, pd.DataFrame], order: float, x: str, y: str, methods: Sequence[str], absent: Mapping[str, str]
 ) -> League:
     rows: dict[str, tuple[Reals, Reals, Reals, Reals]] = {}
     of_objects: dict[str, dict[str, Curve]] = {}
-    left_out, least = dict(unfinished), np.log(NEXT_TO_EQUAL) if y == RELATIVE else -np.inf
+    left_out, least = dict(absent), np.log(NEXT_TO_EQUAL) if y == RELATIVE else -np.inf
     for name, frame in tables.items():
         found = _curves(frame, order, x, y, methods)
         curves = {method: curve for method, curve in found.items() if np.all(curve.values >= least)}
@@ -363,9 +358,9 @@ def _league(
             connected = [method for method, part in zip(methods, parts, strict=True) if part == counts.argmax()]
             reason = "no object connects it with the methods that are compared"
             others = {f"method {method}": reason for method in methods if method not in connected}
-            return _league(tables, order, x, y, connected, {**unfinished, **others})
+            return _league(tables, order, x, y, connected, {**absent, **others})
     # Those with tables tell more.
-    tell_most = sorted(left_out.items(), key=lambda item: item[0] in unfinished)
+    tell_most = sorted(left_out.items(), key=lambda item: item[0] in absent)
     reasons = "; ".join(f"{name}: {reason}" for name, reason in tell_most[:_MOST_REASONS])
     if (more := len(tell_most) - _MOST_REASONS) > 0:
         reasons += f"; {more:,} more"

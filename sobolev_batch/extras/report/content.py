@@ -98,11 +98,7 @@ def reasons_table(name: str, reasons: Mapping[str, str]) -> PageTable | None:
 
 
 def common_content(
-    study: Mapping[str, Any],
-    frames: Mapping[str, pd.DataFrame],
-    status: Status,
-    failed: Mapping[str, str],
-    versions: Mapping[str, str],
+    study: Mapping[str, Any], frames: Mapping[str, pd.DataFrame], status: Status, failed: Mapping[str, str]
 ) -> dict[str, Any]:
     """Return what the pages of one object and of several both show.
 
@@ -119,7 +115,6 @@ def common_content(
         "failed": reasons_table("failed", failed),
         "not_compared": reasons_table("lacking", status.not_compared),
         "status": status,
-        "versions": versions,
         "study_text": tomli_w.dumps(_without_nulls(study)),
     }
 
@@ -142,7 +137,8 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     sentences, rows, omitted = study_verdict(frame, failed)
     orders = frame["order"].drop_duplicates().tolist()
     return {
-        **common_content(study, frames, status, failed, root_attribute(tree, "versions")),
+        **common_content(study, frames, status, failed),
+        "versions": root_attribute(tree, "versions"),
         **cost_content({str(study["study"]["name"]): frame}, families),
         "reference": convergence.attrs["reference"],
         "settings": settings,
@@ -199,7 +195,8 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
     unfinished = {name: "it has no tables yet; run the study again" for name in objects.names if name not in tables}
     missing = unfinished | dict(status.failed)
     return {
-        **common_content(objects.table, tables, status, missing, versions),
+        **common_content(objects.table, tables, status, missing),
+        "versions": versions,
         **cost_content(tables, methods),
         "leagues": leagues,
         "no_league": no_league,
