@@ -260,7 +260,7 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
 )
 @click.option("--suffix", metavar="SUFFIX", help="Give a command files of this format, such as .mesh. [default: .ply]")
 @click.option("--timeout", metavar="TIME", help="End a command after this time, such as '10 min'. [default: 1 h]")
-@output_option("Write meshes and records of trials there.", type=str, required=True, metavar="FOLDER|URL")
+@output_option(help="Write meshes and records of trials there.", type=str, required=True, metavar="FOLDER|URL")
 @workers_option
 @scheduler_options()
 @format_option

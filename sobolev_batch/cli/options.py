@@ -68,11 +68,7 @@ format_option = _in_format(
 json_option = _in_format(
     type=click.Choice(["text", "json"]), help="Print text for people, or one JSON document for programs."
 )
-
-
-def output_option(text: str, **settings: Any) -> Callable[[Callback], Callback]:
-    """Return the option --output of a command that writes files."""
-    return click.option("-o", "--output", **{"type": PATH, "show_default": True, **settings}, help=text)
+output_option = partial(click.option, "-o", "--output", type=PATH, show_default=True)
 
 
 def scheduler_options(*, required: bool = False) -> Callable[[Callback], Callback]:

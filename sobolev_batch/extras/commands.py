@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -18,15 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sobolev_batch.cli.interruption import Deadline
-from sobolev_batch.cli.options import (
-    PATH,
-    Callback,
-    ChosenOrders,
-    location,
-    orders_option,
-    output_option,
-    store_argument,
-)
+from sobolev_batch.cli.options import PATH, ChosenOrders, location, orders_option, output_option, store_argument
 from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, Command
 from sobolev_batch.cli.table_commands import table_options
@@ -54,20 +45,13 @@ _up_option = click.option(
     type=click.Choice(["x", "y", "z"]),
     help="Draw the meshes with this axis pointing up. [default: y or z, what they seem to rest on]",
 )
-
-
-def _meshes_option(text: str, default: str) -> Callable[[Callback], Callback]:
-    return click.option(
-        *("--mesh", "meshes"),
-        multiple=True,
-        metavar="MESH",
-        help=f"{text} A pattern such as 'scans/*' stands for several. The option may be repeated. [default: {default}]",
-    )
+_meshes_option = partial(click.option, *("--mesh", "meshes"), multiple=True, metavar="MESH")
+_meshes_help = "{} A pattern such as 'scans/*' stands for several. The option may be repeated. [default: {}]".format
 
 
 @click.command("init", cls=Command, short_help="Write a study file for a folder of meshes.")
 @click.argument("folder", type=PATH, default=".")
-@output_option("Write the study to this file, which must not exist.", default="study.toml")
+@output_option(help="Write the study to this file, which must not exist.", default="study.toml")
 def init_command(folder: Path, output: Path) -> None:
     """Write a study file for the meshes in FOLDER.
 
@@ -85,7 +69,7 @@ def init_command(folder: Path, output: Path) -> None:
 )
 @click.argument("start", type=PATH)
 @click.argument("target", type=PATH)
-@output_option("Write the mesh to this file, .ply, .obj, .off or .stl.", required=True)
+@output_option(help="Write the mesh to this file, .ply, .obj, .off or .stl.", required=True)
 @click.option("--order", type=float, default=DEFAULT_ORDER, show_default=True, help="Lower the distance of this order.")
 @click.option("--steps", type=int, default=DEFAULT_STEPS, metavar="N", show_default=True, help="Take N steps at most.")
 @click.option(
@@ -164,7 +148,7 @@ def _text(quality: FitQuality, scale: float) -> str:
 
 @click.command("plot", cls=Command)
 @store_argument
-@output_option("Write the pictures into this folder.", default=".")
+@output_option(help="Write the pictures into this folder.", default=".")
 @click.option(
     *("--format", "formats"),
     type=click.Choice(["png", "svg", "pdf"]),
@@ -187,7 +171,7 @@ def _text(quality: FitQuality, scale: float) -> str:
     help="Draw convergence over this: edge_length, triangles, vertices, seconds, or a number among the metadata of the "
     "meshes. [default: edge_length, triangles for a league]",
 )
-@_meshes_option("Draw this mesh with its witness function.", "a few")
+@_meshes_option(help=_meshes_help("Draw this mesh with its witness function.", "a few"))
 @_folder_option
 @_up_option
 @click.option(
@@ -267,7 +251,7 @@ def _require_folder(path: Path) -> None:
 
 @click.command("witness", cls=Command)
 @store_argument
-@_meshes_option("Write this mesh.", "all")
+@_meshes_option(help=_meshes_help("Write this mesh.", "all"))
 @orders_option("Write witness functions of this order, which may be any below -1/2.", "the study's")
 @click.option(
     *("--format", "style"),
@@ -277,7 +261,7 @@ def _require_folder(path: Path) -> None:
     help="Write ply for MeshLab and similar programs, or vtp for ParaView.",
 )
 @click.option("--distances", is_flag=True, help="Also write the distance of each vertex from the reference.")
-@output_option("Write the files into this folder.", default=".")
+@output_option(help="Write the files into this folder.", default=".")
 @_folder_option
 def witness_command(
     store: Location,
@@ -316,10 +300,10 @@ def witness_command(
 
 @click.command("report", cls=Command)
 @store_argument
-@output_option("Write the page to this file.", default="report.html")
+@output_option(help="Write the page to this file.", default="report.html")
 @_folder_option
 @_up_option
-@_meshes_option("Show this mesh with its witness function.", "a few")
+@_meshes_option(help=_meshes_help("Show this mesh with its witness function.", "a few"))
 def report_command(store: Location, output: Path, folder: Path, up: Axis | None, meshes: tuple[str, ...]) -> None:
     """Write the results of STORE as one HTML page.
 
@@ -338,7 +322,7 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis | None,
 
 @click.command("export", cls=Command)
 @store_argument
-@output_option("Write the tables to this file.", required=True)
+@output_option(help="Write the tables to this file.", required=True)
 @click.option(
     *("--format", "style"),
     type=click.Choice(["parquet", "netcdf", "csv"]),

@@ -47,8 +47,7 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
         the reference's label and the bound, and of several objects as ``left_out`` the names of those without tables.
 
     Raises:
-        InputError: The store has no tables yet, no such order or no triangles, or the bound is not
-            between 0 and 1.
+        InputError: The store has no tables yet, no such order or no triangles, or the bound is not between 0 and 1.
         StoreError: The location has no store of a study.
 
     >>> import sobolev_batch as sb
