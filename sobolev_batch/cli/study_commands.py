@@ -81,6 +81,7 @@ def run_command(
     The exit status is 3 if a mesh failed, or if a distance is less accurate than the study requires.
     """
     from sobolev_batch.batch.run import run
+    from sobolev_batch.reduction.searched import SearchedSource
     from sobolev_batch.study.study import as_study
     from sobolev_batch.tables.conclusion import format_objects, format_verdict
     from sobolev_batch.tables.convergence import format_table
@@ -93,7 +94,11 @@ def run_command(
     else:
         try:
             league = extra(COMMANDS, "table league", "the command 'table league'")
-            context.invoke(league, store=location(summary.store), orders=None)
+            families = [family for one in parsed.objects.values() for family in one.families]
+            # Families within tolerances were made to find their fewest triangles.
+            is_searched = all(isinstance(family.source, SearchedSource) for family in families)
+            sizes = {"columns": ("triangles",), "x": "target_tolerance"} if is_searched else {}
+            context.invoke(league, store=location(summary.store), orders=None, **sizes)
         except InputError as problem:
             echo(f"no league: {problem}")
         with suppress(InputError):  # As the league says, no object has tables.

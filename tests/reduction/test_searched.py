@@ -26,7 +26,8 @@ from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Plan
 from sobolev_batch.tables.convergence import format_table
 from tests.batch.test_reduce import EndedError, disc, farthest, found_by, lumpy
-from tests.support.commands import call
+from tests.support.commands import call, output
+from tests.support.processes import with_certificates
 
 DECIMATED: dict[str, Any] = {"name": "decimated", "source": "decimate", "within": "1 mm"}
 # A remesher of Python alone, which makes discs of this many edges.
@@ -103,6 +104,17 @@ def test_meshes_of_two_objects_hold_and_are_those_of_reduce(client: Client, fold
     again = sb.run(sb.Study.from_table(described, folder=folder), store, client=client)
     assert again.computed == ()
     assert {path.name: path.stat().st_mtime_ns for path in (folder / "made-meshes").iterdir()} == before
+
+
+def test_a_run_prints_the_fewest_triangles_first(client: Client, folder: Path) -> None:
+    scans = {"source": "files", "paths": [str(folder / "scans" / "{object}.ply")]}
+    (folder / "study.toml").write_text(tomli_w.dumps(table(DECIMATED, reference=scans)))
+    assert client.scheduler is not None
+    with with_certificates(client):
+        shown = output("run", "study.toml", "--scheduler", client.scheduler.address, folder=folder)
+    means = sb.table(folder / "storage" / "scans.zarr").query("triangles < 320")["triangles"]
+    assert shown.startswith("League by triangles, over 2 objects")
+    assert f"{np.exp(np.log(means).mean()):.3g}" in shown.splitlines()[4].replace(",", "")
 
 
 @pytest.mark.parametrize("allow_commands", [False, True])

@@ -29,11 +29,14 @@ from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import number_text, times, wrapped
 from sobolev_batch.transform.lattice import Orders
 
-LEAGUE_NOTE = """\
-Numbers ({y}) are geometric means over the objects, at equal {x}. Their 95 % intervals tell how methods compare: they
-hold the errors of the numbers, and not that some objects are harder than others. A rank such as 1-3 says which places
-the intervals allow. Rates are slopes over the edge length. Two methods differ where the permutation test of pairs says
-so, at the level of 5 % for all pairs together. Pairs are compared at the sizes and over the objects that both have."""
+_MEANS_NOTE = """\
+Numbers ({y}) are geometric means over the objects, at equal {x}, with 95 % intervals. Rates are slopes over the edge
+length."""
+_RANKS_NOTE = """
+The intervals tell how methods compare: they hold the errors of the numbers, and not that some objects are harder than
+others. A rank such as 1-3 says which places the intervals allow. Two methods differ where the permutation test of pairs
+says so, at the level of 5 % for all pairs together. Pairs are compared at the sizes and over the objects that both
+have."""
 
 # What methods are compared by unless another number is named.
 RELATIVE = "relative"
@@ -270,7 +273,7 @@ def league(
     objects = objects_of(store)
     if not objects and by == "size":
         place = source_of(store) if isinstance(store, xr.DataTree) else store
-        raise StoreError(f"{place}: it holds the store of one object; take that of several, or some by their names")
+        raise StoreError(f"{place}: it does not hold several objects; take a store that does, or several stores by their names")
     if not objects:
         tree = as_tree(store)  # type: ignore[arg-type]  # stores by name have objects
         objects = (str(root_attribute(tree, "study")["name"]),)
@@ -395,9 +398,16 @@ def format_league(leagues: Sequence[League], style: Format = "text") -> str:
     """Return leagues as text; see `league`."""
     frame = pd.concat([one.table.assign(order=one.order) for one in leagues], ignore_index=True)
     sections = [Section(one.caption, [(league_columns(one.y), one.table)], pair_lines(one)) for one in leagues]
-    notes = wrapped(LEAGUE_NOTE.format(x=leagues[0].x, y=", ".join(dict.fromkeys(_in_units(one.y) for one in leagues))))
+    notes = wrapped(league_note(leagues))
     notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
     return rendered(style, frame[["order", *frame.columns.drop("order")]], sections, notes)
+
+
+def league_note(leagues: Sequence[League]) -> str:
+    """Return how to read leagues at one size; of a single method, nothing on ranks and pairs."""
+    ranks = _RANKS_NOTE if any(len(one.methods) > 1 for one in leagues) else ""
+    numbers = ", ".join(dict.fromkeys(_in_units(one.y) for one in leagues))
+    return _MEANS_NOTE.format(x=leagues[0].x, y=numbers) + ranks
 
 
 def _in_units(y: str) -> str:

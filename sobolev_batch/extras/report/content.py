@@ -14,11 +14,11 @@ from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.leagues.costs import COST_NOTE, METHOD_COLUMNS, CostLeague, cost_leagues_of, front_columns
 from sobolev_batch.extras.leagues.league import (
-    LEAGUE_NOTE,
     PAIR_COLUMNS,
     RELATIVE,
     League,
     league_columns,
+    league_note,
     leagues_of,
     left_out,
     pair_lines,
@@ -201,7 +201,7 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
         "leagues": leagues,
         "no_league": no_league,
         "differences": tuple(tuple(pair_lines(one)) for one in leagues),
-        "note": LEAGUE_NOTE.format(x=leagues[0].x, y=RELATIVE).replace("\n", " ") if leagues else "",
+        "note": league_note(leagues).replace("\n", " ") if leagues else "",
         "league": PageTable("league", _LEAGUE_COLUMNS, ranked, [*by_order]),
         "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, [*by_order]) if pairs else None,
         "objects": PageTable("objects", _OBJECT_COLUMNS, of_objects, orders),

@@ -233,7 +233,10 @@ def test_methods_that_no_object_connects_with_most_are_left_out_and_named() -> N
 
 def test_methods_may_be_chosen_and_must_be_known() -> None:
     one = of_powers({"a": 1}, 1.0)
-    assert ranked({"x": POWERS, "y": one}, methods="a").objects == ("x", "y")
+    alone = ranked({"x": POWERS, "y": one}, methods="a")
+    assert alone.objects == ("x", "y")
+    # Without another method, nothing is said of ranks and pairs.
+    assert ["pairs" in str(made) for made in (alone, ranked({"x": POWERS}))] == [False, True]
     with pytest.raises(
         sb.errors.InputError, match=r"compare the methods a, b \(y: no distance of b; w: no distance of a\)"
     ):
