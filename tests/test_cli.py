@@ -265,6 +265,17 @@ def test_the_exit_status_of_a_verdict(folder: Path) -> None:
         assert done.stdout.count("\n") == 1
 
 
+def test_rounding_is_no_distance(folder: Path) -> None:
+    # The same square in other triangles, turned so that coordinates are rounded.
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    corners = np.array([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0], [4, 3, 0]]) @ turn.T
+    sb.write_mesh(sb.Mesh(corners, [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]), folder / "square.ply")
+    sb.write_mesh(sb.Mesh(corners, [[0, 1, 2], [0, 2, 3]]), folder / "same.ply")
+    shown = output("compare", "square.ply", "same.ply", "--proximity", "--order=-4", folder=folder)
+    rows = re.findall(r"^(?:mean|RMS|\d\d % within|normals, \w+) {2,}(.*)$", shown, re.M)
+    assert [set(row.replace(" deg", "").split()) for row in rows] == [{"0"}] * 7
+
+
 def test_a_hole_that_was_closed_is_seen(folder: Path) -> None:
     for name, hole in (("full.off", False), ("hole.off", True)):
         sb.write_mesh(plate(hole), folder / name)

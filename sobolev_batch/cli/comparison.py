@@ -325,9 +325,13 @@ class Comparison:
     def rows(self) -> list[list[str]]:
         """The usual distances of points: their name, from A to B, from B to A, and the larger one."""
         found, rows = self.nearness or {}, []
+        farthest = float(np.abs([mesh.extent.box for mesh in (self.first, self.second)]).max())
         for name, title in _DISTANCES.items() if found else ():
-            ending = " deg" if name.startswith("normal") else ""
-            rows.append([title, *(f"{found[f'{name}{way}']:.4g}{ending}" for way in ("_forward", "_backward", ""))])
+            ending, largest = (" deg", 360.0) if name.startswith("normal") else ("", farthest)
+            values = [found[f"{name}{way}"] for way in ("_forward", "_backward", "")]
+            # Less than the rounding of coordinates and angles is nothing.
+            known = (0.0 if value < np.finfo(float).eps * largest else value for value in values)
+            rows.append([title, *(f"{value:.4g}{ending}" for value in known)])
         return rows
 
     @property
