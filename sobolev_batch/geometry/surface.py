@@ -143,8 +143,7 @@ class Similarity:
         Raises:
             InputError: It is a single point, or no surface, such as the path of a mesh that is still to be read.
         """
-        if not hasattr(surface, "bounding_sphere"):
-            raise InputError(f"a surface is needed, such as read_mesh({str(surface)[:50]!r}), found {type(surface)}")
+        _require_surface(surface)
         center, radius = surface.bounding_sphere
         if not radius > 0:
             raise InputError("a single point has no size to scale a study by; give the scaling, or another reference")
@@ -156,8 +155,14 @@ class Similarity:
         return self.scale == 1.0 and self.origin == (0.0, 0.0, 0.0)
 
     def apply(self, surface: SurfaceType) -> SurfaceType:
-        """Return the surface in the unit of length of the study."""
+        """Return the surface in the unit of length of the study; InputError if it is none, such as bare arrays."""
+        _require_surface(surface)
         return surface if self.is_identity else surface.moved(self.scale, self.origin)
+
+
+def _require_surface(value: object) -> None:
+    if not hasattr(value, "bounding_sphere"):
+        raise InputError(f"a surface is needed, as as_mesh makes one of arrays or of a file, found {type(value)}")
 
 
 def centering(surfaces: Sequence[Surface], tolerance: float = 0.0) -> Similarity:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Mesh
+from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.surface import placement_doubt
 from sobolev_batch.shapes import Similarity, Sphere, icosphere
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES, box, tetrahedron
@@ -27,6 +28,13 @@ def test_the_identity_hands_the_surface_through() -> None:
         assert Similarity().apply(surface) is surface
     assert not Similarity(1.0, (0.0, 0.0, 1e-300)).is_identity
     assert not Similarity(math.nextafter(1, 2)).is_identity
+
+
+def test_bare_arrays_are_no_surface() -> None:
+    arrays: Any = BOX_VERTICES, BOX_TRIANGLES
+    for use in (Similarity(2.0).apply, Similarity.to_unit_ball):
+        with pytest.raises(InputError, match="a surface is needed, as as_mesh makes"):
+            use(arrays)
 
 
 FLAT = Mesh([[2.0, 5.0, 7.0], [8.0, 5.0, 7.0], [2.0, 13.0, 7.0]], [[0, 1, 2]])

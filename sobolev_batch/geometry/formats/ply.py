@@ -154,7 +154,7 @@ def _parsed_header(data: bytes) -> tuple[dict[str, _Element], int, bool]:
     """Return the elements that a header announces, the place where it ends, and whether text follows."""
     header = _HEADER.match(data)
     if header is None:
-        raise MeshError(f"no PLY header begins the file and ends within its first {HEADER_BYTES} bytes")
+        raise MeshError(f"no PLY header begins the file and ends in its first {HEADER_BYTES:,} bytes; is it cut off?")
     elements: dict[str, _Element] = {}
     order = ""
     # Some programs write X for x.

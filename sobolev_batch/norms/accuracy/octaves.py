@@ -234,8 +234,7 @@ class State:
 
     def advanced(self, seconds: float, **changes: object) -> Self:
         """Return the state after a step of some predicted time."""
-        octaves = f"{len(self.octaves)} octave{'s' * (len(self.octaves) != 1)}"
-        self.problem.notify(f"{self.problem.label}: {octaves}, step {self.steps}")
+        self.problem.notify(f"{self.problem.label}: short wavelengths, step {self.steps + 1}")
         return replace(self, seconds=self.seconds + seconds, steps=self.steps + 1, **changes)  # type: ignore[arg-type]
 
 
@@ -247,7 +246,7 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: 
     else the last one that can be sampled in some minutes. AccuracyError where the accuracy lies below rounding.
     """
     aimed = problem.with_rtol(aim * problem.accuracy.rtol)
-    problem.notify(f"{problem.label}: octaves beyond a lattice")
+    problem.notify(f"{problem.label}: short wavelengths")
     lattice = core_lattice(aimed.support, aimed.orders, aimed.accuracy)
     core = Core.on_lattice(aimed, lattice)
     beyond = Remainder.alike(lattice.xi_max, error=np.inf) if for_others else aimed.beyond(lattice.xi_max, seed)
