@@ -274,6 +274,8 @@ def test_rounding_is_no_distance(folder: Path) -> None:
     shown = output("compare", "square.ply", "same.ply", "--proximity", "--order=-4", folder=folder)
     rows = re.findall(r"^(?:mean|RMS|\d\d % within|normals, \w+) {2,}(.*)$", shown, re.M)
     assert [set(row.replace(" deg", "").split()) for row in rows] == [{"0"}] * 7
+    # Nor has a place more digits than are of use, or a mean of nothing an error.
+    assert not re.search(r"\d{7}|\N{MULTIPLICATION SIGN} 10", shown)
 
 
 def test_a_hole_that_was_closed_is_seen(folder: Path) -> None:

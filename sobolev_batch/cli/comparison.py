@@ -279,7 +279,7 @@ class Comparison:
             for direction, way in (("A to B", self.deviations.forward), ("B to A", self.deviations.backward)):
                 yield f"largest deviation, {direction}: {deviation_text(way, self.unit)}"
             yield from printed_table(self.rows, [f"in {self.unit}", "A to B", "B to A", "larger"], "text").split("\n")
-            yield from _proximity_lines(self.nearness, (self.first, self.second), self.unit)
+            yield from _proximity_lines(self._resolved, (self.first, self.second), self.unit)
 
     @property
     def sentences(self) -> Iterator[str]:
@@ -324,15 +324,19 @@ class Comparison:
     @property
     def rows(self) -> list[list[str]]:
         """The usual distances of points: their name, from A to B, from B to A, and the larger one."""
-        found, rows = self.nearness or {}, []
-        farthest = float(np.abs([mesh.extent.box for mesh in (self.first, self.second)]).max())
+        found, rows = self._resolved, []
         for name, title in _DISTANCES.items() if found else ():
-            ending, largest = (" deg", 360.0) if name.startswith("normal") else ("", farthest)
-            values = [found[f"{name}{way}"] for way in ("_forward", "_backward", "")]
-            # Less than the rounding of coordinates and angles is nothing.
-            known = (0.0 if value < np.finfo(float).eps * largest else value for value in values)
-            rows.append([title, *(f"{value:.4g}{ending}" for value in known)])
+            ending = " deg" if name.startswith("normal") else ""
+            rows.append([title, *(f"{found[f'{name}{way}']:.4g}{ending}" for way in ("_forward", "_backward", ""))])
         return rows
+
+    @property
+    def _resolved(self) -> dict[str, float]:
+        """The usual distances, zero where they are less than the rounding of coordinates or angles."""
+        farthest = float(np.abs([mesh.extent.box for mesh in (self.first, self.second)]).max())
+        least = {True: 360 * np.finfo(float).eps, False: farthest * np.finfo(float).eps}
+        found = self.nearness or {}
+        return {name: 0.0 if abs(x) < least[name.startswith("normal")] else x for name, x in found.items()}
 
     @property
     def _by_order(self) -> list[xr.Dataset]:

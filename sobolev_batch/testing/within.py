@@ -144,4 +144,5 @@ def assert_within(
 def deviation_text(deviation: Deviation, unit: str | None, digits: int = _DIGITS) -> str:
     """Return the bounds of a deviation with their unit, the upper one where it is known, and the place."""
     bounds = (0.0, 0.0) if deviation.upper <= deviation.rounding else (deviation.lower, deviation.upper)
-    return f"{between(*bounds, f' {unit}' if unit else '', digits)}, at {place_text(deviation.place, deviation.lower)}"
+    place = place_text(deviation.place, bounds[math.isfinite(bounds[1])] or 1.0)
+    return f"{between(*bounds, f' {unit}' if unit else '', digits)}, at {place}"
