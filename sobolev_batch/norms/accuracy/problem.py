@@ -206,7 +206,7 @@ class Problem:
     def beyond(self, cutoff: float, seed: int = 0, points: int | None = None) -> Remainder:
         """Return what lies beyond a cutoff at the orders; see `remainder`."""
         execution = Execution(threads=self.threads)
-        return remainder(self.surfaces, self.signs, cutoff, self.orders, points, seed, execution)
+        return remainder(self.surfaces, self.signs, cutoff, self.orders, points, seed=seed, execution=execution)
 
     def require_above_rounding(self, values: Reals) -> None:
         """Refuse an accuracy of norms (orders,) below the rounding of fields, unless it is a best effort."""
