@@ -151,7 +151,8 @@ def info_command(context: click.Context, files: tuple[Path, ...], style: str) ->
     """
     from sobolev_batch.geometry.formats.readers import read_mesh
 
-    facts, refused = list[dict[str, Any]](), list[MeshError]()
+    facts: list[dict[str, Any]] = []
+    refused: list[MeshError] = []
     for path in files:
         try:
             facts.append(_facts(path, read_mesh(path)))

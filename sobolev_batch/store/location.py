@@ -244,7 +244,7 @@ class Location:
 
 def _folder_name(store: str | Path) -> str:
     if not str(store) or "\0" in str(store):
-        raise StoreError(f"a store's path is not empty and has no null character, found {store!r}; name another")
+        raise StoreError(f"the path of a store must be neither empty nor hold a null character, found {store!r}")
     first = next(iter(path_of(store).parts), "")
     if first.endswith(":") and first[:-1] in available_protocols():
         # The rest may hold a password.

@@ -410,7 +410,7 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     assert (of_eggs["method"].tolist(), of_eggs.attrs["lost"]) == (["egg"], ())
     with pytest.raises(sb.errors.InputError, match="no method is named 'icos'; known are ico, egg"):
         sb.compare_studies(one, one, methods=["icos"])
-    with pytest.raises(sb.errors.StoreError, match="it holds the store of one object"):
+    with pytest.raises(sb.errors.StoreError, match="does not hold several objects"):
         sb.league(store / "a")
     with pytest.raises(sb.errors.StoreError, match="nowhere"):
         sb.league({"a": store / "a", "b": store / "nowhere"})

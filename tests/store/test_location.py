@@ -59,7 +59,7 @@ def test_folders_and_urls(place: str | Path, name: str, scheme: str) -> None:
         ("s3:///a.zarr", "names no place in a bucket"),
         (Path("s3://bucket/hidden.zarr"), "this begins with s3:/ and a URL with s3://; a Path cannot hold a URL"),
         ("s3:/bucket/hidden.zarr", "this begins with s3:/ and a URL with s3://"),
-        ("", "the path of the store is empty"),
+        ("", "must be neither empty"),
     ],
 )
 def test_urls_that_are_refused_and_not_repeated(place: str | Path, message: str) -> None:
