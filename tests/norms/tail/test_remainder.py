@@ -108,10 +108,11 @@ def test_vertices_that_no_triangle_uses_and_triangles_without_area_do_not_matter
     assert remainder([stray], [1], 60.0, ORDERS).energies == pytest.approx(remainder([BOX], [1], 60.0, ORDERS).energies)
 
 
-def test_slivers_no_wider_than_rounding_do_not_matter() -> None:
-    corners = np.concatenate([BOX.vertices, [[0.1, 0.2, 0.0], [0.1, 0.2, 1e-19], [0.4, 0.2, 0.0]]])
+@pytest.mark.parametrize(("width", "has_area"), [(1e-19, False), (2e-15, True)])
+def test_slivers_no_wider_than_rounding_do_not_matter(width: float, has_area: bool) -> None:
+    corners = np.concatenate([BOX.vertices, [[0.1, 0.2, 0.0], [0.1, 0.2, width], [0.4, 0.2, 0.0]]])
     more = Mesh(corners, np.concatenate([BOX.triangles, [len(BOX.vertices) + np.arange(3)]]))
-    assert more.areas[-1] > 0
+    assert (more.areas[-1] > 0) == has_area
     assert remainder([more], [1], 60.0, ORDERS).energies == pytest.approx(remainder([BOX], [1], 60.0, ORDERS).energies)
 
 
