@@ -232,9 +232,9 @@ def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
 def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
     lattice, transform, execution = job.lattice, job.transform, job.execution
     if target:
-        field = field_for(surface, lattice, target, transform, execution)
+        field = field_for(surface, lattice, target, transform, execution, lasting=True)
     else:
-        field = compute_field(surface, lattice, transform, job.orders, execution)
+        field = compute_field(surface, lattice, transform, job.orders, execution, lasting=True)
     checksum = Fields(job.store).write(job.row, lattice.half.place_in(lattice.half), field.values)
     facts = Facts.of_surface(surface, field.points)
     return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
@@ -247,7 +247,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: E
         return _store_whole(job, surface, target)
     transform = choose_settings(surface, lattice, target, job.transform) if target else job.transform
     kind = transform.kind_for(surface, lattice)
-    draws = draws_for([surface], lattice, job.orders, kind.lowest_degree, COMMON)
+    draws = draws_for([surface], lattice, job.orders, kind.lowest_degree, COMMON, lasting=True)
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
         result = transform_block(surface, lattice, block, transform, execution, kind)

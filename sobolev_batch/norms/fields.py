@@ -174,9 +174,22 @@ def fourier_transform(
     >>> round(field.sel(xi_x=0, xi_y=0, xi_z=0).item().real, 4)  # the area of the sphere, 4π
     12.5664
     """
-    settings, lattice = TransformSettings(eps, dtype, quadrature), check_lattice(lattice)
     execution = Execution(backend_named(backend), thread_count(threads))
-    field = compute_field(as_surface(surface), lattice, settings, check_orders(order), execution)
+    return _transformed(surface, lattice, TransformSettings(eps, dtype, quadrature), order, execution, lasting=True)
+
+
+def _transformed(
+    surface: SurfaceLike,
+    lattice: Lattice,
+    settings: TransformSettings,
+    order: Orders,
+    execution: Execution,
+    *,
+    lasting: bool = False,
+) -> xr.DataArray:
+    """Return the field of a surface with its attributes; see `fourier_transform`."""
+    lattice = check_lattice(lattice)
+    field = compute_field(as_surface(surface), lattice, settings, check_orders(order), execution, lasting=lasting)
     attributes = {
         "long_name": "Fourier transform of the area measure",
         "units": "squared units of length",
@@ -201,15 +214,18 @@ def compute_field(
     execution: Execution = ON_CPU,
     *,
     sample: Sample | None = None,
+    lasting: bool = False,
 ) -> Field:
     """Return the field of a surface by given settings, with its probe for some orders; see `transform_block`.
 
-    A sample of the surface, drawn for these orders and `USUAL_DEGREE`, saves time.
+    A sample of the surface, drawn for these orders and `USUAL_DEGREE`, saves time. A lasting field is probed for
+    others too.
     """
     kind = settings.kind_for(surface, lattice)
     transformed = transform_block(surface, lattice, lattice.half, settings, execution, kind)
     values, sample = transformed.values, sample if kind.lowest_degree <= USUAL_DEGREE else None
-    draws = sample.draws if sample else draws_for([surface], lattice, orders, kind.lowest_degree, COMMON)
+    draws = sample and sample.draws
+    draws = draws or draws_for([surface], lattice, orders, kind.lowest_degree, COMMON, lasting=lasting)
     probe = probe_block(surface, lattice, settings, lattice.half, values, draws, execution, sample)
     quality = Quality(surface.area, surface.extent, probe)
     return Field(values, transformed.points, transformed.backend, quality, settings)
@@ -223,17 +239,18 @@ def field_for(
     execution: Execution = ON_CPU,
     *,
     sample: Sample | None = None,
+    lasting: bool = False,
 ) -> Field:
     """Return the field of a surface with an error within a target, by the estimate of its probe; see `compute_field`.
 
     It is the first of a few attempts that meets the target, or the last, in the dtype and quadrature of the settings.
     """
     if kind_of(surface).is_closed_form:
-        return compute_field(surface, lattice, settings, target.orders, sample=sample)
+        return compute_field(surface, lattice, settings, target.orders, sample=sample, lasting=lasting)
     for _ in range(_ATTEMPTS):
         chosen = choose_settings(surface, lattice, target, settings)
         chosen = replace(chosen, eps=max(chosen.eps / _EPS_CAUTION, FINEST_EPS[chosen.dtype]))
-        field = compute_field(surface, lattice, chosen, target.orders, execution, sample=sample)
+        field = compute_field(surface, lattice, chosen, target.orders, execution, sample=sample, lasting=lasting)
         excess = float(np.max(field.quality.probe.norms(SobolevWeights(lattice, target.orders)) / target.norms))
         if excess <= 1:
             break
@@ -260,7 +277,7 @@ def field_of(
     if lattice is None:
         found = type(a).__name__
         raise InputError(f"this {found} needs a lattice=Lattice(xi_max=..., M=...) or, in norms and distances, an rtol")
-    return fourier_transform(a, lattice, eps, order=orders)
+    return _transformed(a, lattice, TransformSettings(eps), orders, Execution(threads=thread_count(None)))
 
 
 def check_lattice(lattice: object) -> Lattice:

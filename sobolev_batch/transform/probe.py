@@ -27,6 +27,8 @@ _MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000
 _CAUTION = 8.0
 # Points of a quarter of the lattice's x and y that are looked at together for some shells.
 _CANDIDATES = 1 << 20
+# Drawn for -20 alone, errors of -2 were up to a thousand times too small, and the other way round.
+_OTHER_ORDERS = (-2.0, -30.0)
 # Ranges of |ξ| that represent an error of the same size at every frequency.
 _BANDS = 8
 _TINY = np.finfo(np.float64).tiny
@@ -211,16 +213,26 @@ class Sample:
 
 
 def draws_for(
-    surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int, fraction: float = 1.0
+    surfaces: Sequence[Surface],
+    lattice: Lattice,
+    orders: Sequence[float],
+    degree: int,
+    fraction: float = 1.0,
+    *,
+    lasting: bool = False,
 ) -> Draws:
     """Draw the frequencies to probe fields of surfaces at, by their lowest degree: fewer where each costs more.
 
-    The fraction is `COMMON` where the draws serve one field alone, which adds some of its own.
+    The fraction is `COMMON` where the draws serve one field alone, which adds some of its own. A lasting field may be
+    compared at other orders later: its draws serve orders far from these too.
     """
     terms = max(max(kind_of(surface).triangles, 1) for surface in surfaces)
-    count = int(fraction * np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
+    others = [one for one in _OTHER_ORDERS if lasting and not min(orders) <= one <= max(orders)]
+    # Each order keeps its draws.
+    share = fraction * (len(orders) + len(others)) / len(orders)
+    count = int(share * np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
     seed = int(np.float64(sum(surface.area for surface in surfaces)).view(np.uint64))
-    return draw(lattice, orders, degree, count, seed)
+    return draw(lattice, [*orders, *others], degree, count, seed)
 
 
 def probe_block(

@@ -47,6 +47,19 @@ def test_whichever_frequencies_are_drawn_their_probe_covers_the_error(surface: S
     assert np.median(ratios) < 3
 
 
+@pytest.mark.parametrize("probed", [-0.6, -2.0, -20.0, -100.0])
+def test_an_error_that_is_probed_at_one_order_serves_others(probed: float) -> None:
+    orders, ratios = (-0.6, -2.0, -5.0, -20.0, -100.0), []
+    for size in np.linspace(0.5, 1.0, 8):
+        mesh = Mesh(size * CENTRED_BOX.vertices, CENTRED_BOX.triangles)
+        coarse = fourier_transform(mesh, LATTICE, quadrature=2, order=probed, threads=1)
+        true_errors = distance(coarse, fourier_transform(mesh, LATTICE, 1e-14, threads=1), orders)["distance"].values
+        probe = Quality.from_json(coarse.attrs["quality"]).probe
+        ratios.append(probe.norms(SobolevWeights(LATTICE, orders)) / true_errors)
+    assert np.min(ratios) > 1
+    assert np.median(ratios) < 3
+
+
 @pytest.mark.slow
 def test_tiny_surfaces_have_distances_at_orders_whose_weights_underflow() -> None:
     size, offset, order = 1e-6, 1e-8, -30.0

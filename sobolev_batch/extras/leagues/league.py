@@ -273,7 +273,9 @@ def league(
     objects = objects_of(store)
     if not objects and by == "size":
         place = source_of(store) if isinstance(store, xr.DataTree) else store
-        raise StoreError(f"{place}: it does not hold several objects; take a store that does, or several stores by their names")
+        raise StoreError(
+            f"{place}: it does not hold several objects; take a store that does, or several stores by their names"
+        )
     if not objects:
         tree = as_tree(store)  # type: ignore[arg-type]  # stores by name have objects
         objects = (str(root_attribute(tree, "study")["name"]),)
