@@ -74,7 +74,7 @@ class Pairs:
         others = ("other", meshes["mesh"].values, dict(VARIABLES["other"]))
         keys = dataset_keys(DISTANCES, describe(meshes.assign_coords(other=others, part=np.array(PARTS, dtype=object))))
         # xarray makes coordinates of what `coordinates` names.
-        names = " ".join(["key", *map(str, meshes.coords.keys() - meshes.sizes.keys())])
+        names = " ".join(["key", *sorted(map(str, meshes.coords.keys() - meshes.sizes.keys()))])
         for name in _COLUMNS:
             path, dimensions = f"{DISTANCES}/{name}", ("mesh", "other", "order")
             attributes = {**VARIABLES[name], "coordinates": names}
