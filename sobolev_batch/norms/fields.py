@@ -219,13 +219,15 @@ def compute_field(
     """Return the field of a surface by given settings, with its probe for some orders; see `transform_block`.
 
     A sample of the surface, drawn for these orders and `USUAL_DEGREE`, saves time. A lasting field is probed for
-    others too.
+    orders far from these too.
     """
     kind = settings.kind_for(surface, lattice)
     transformed = transform_block(surface, lattice, lattice.half, settings, execution, kind)
     values, sample = transformed.values, sample if kind.lowest_degree <= USUAL_DEGREE else None
-    draws = sample and sample.draws
-    draws = draws or draws_for([surface], lattice, orders, kind.lowest_degree, COMMON, lasting=lasting)
+    if sample is None:
+        draws = draws_for([surface], lattice, orders, kind.lowest_degree, COMMON, lasting=lasting)
+    else:
+        draws = sample.draws
     probe = probe_block(surface, lattice, settings, lattice.half, values, draws, execution, sample)
     quality = Quality(surface.area, surface.extent, probe)
     return Field(values, transformed.points, transformed.backend, quality, settings)
