@@ -156,6 +156,13 @@ def test_a_count_sees_each_transform() -> None:
     assert two == {name: 2 * count for name, count in one.items()}
 
 
+def test_fields_that_are_kept_are_probed_for_other_orders_too() -> None:
+    mesh = sb.shapes.icosphere(1)
+    once = work_of(lambda: sb.norm(mesh, -4.0, lattice=SMALL_LATTICE))["exact"]
+    assert work_of(lambda: sb.fourier_transform(mesh, SMALL_LATTICE, order=-4.0))["exact"] > once
+    assert work_of(partial(run_study, "kept", 1))["exact"] > once
+
+
 # How often a run lists a source, checks a mesh, and asks for the version of a program; and reads each file as a whole.
 Counts = Counter[str]
 
