@@ -228,7 +228,8 @@ class Study:
         Raises:
             StudyError: See `from_toml`.
         """
-        values, folder = plain_tables(table), path_of(folder)
+        # Absolute, since a worker that plans an object may have been started in another folder.
+        values, folder = plain_tables(table), path_of(folder).absolute()
         document, sections = sections_of_objects(values, folder)
         objects: dict[str, StudyObject] = {}
         for name, (of_object, as_written) in sections.items():

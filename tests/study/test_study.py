@@ -353,6 +353,16 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
             sb.Study.from_toml(tmp_path / name)
 
 
+def test_a_study_finds_its_files_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers, which plan its objects, may have been started elsewhere."""
+    sb.write_mesh(sb.shapes.icosphere(1), tmp_path / "ball.ply")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    study = Study.from_table(small_table(family=[{"name": "one", "source": "files", "paths": ["*.ply"]}]))
+    monkeypatch.chdir("elsewhere")
+    assert "one/ball" in study.object.members
+
+
 @pytest.mark.parametrize(
     "call",
     [
