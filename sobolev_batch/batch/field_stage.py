@@ -38,7 +38,7 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
         Records(store).write(i, record)
         take(i, record)
 
-    reference = reference_in_tasks(plan)
+    reference, shared = reference_in_tasks(plan), plan.without_surfaces()
 
     def tasks() -> Iterator[Task]:
         for i in pending:
@@ -47,7 +47,7 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
                 give_up(i, refused[row.label])
                 continue
             groups, allowed_bytes, task_bytes = sizes[row.label]
-            yield _field_task(Job.for_row(plan, row, store, i, allowed_bytes, reference), groups, task_bytes)
+            yield _field_task(Job(store, i, row, shared, allowed_bytes, reference), groups, task_bytes)
 
     projected_bytes = max((one.task_bytes for one in sizes.values()), default=0.0)
     seconds = {rows[i].label: row_seconds(plan, rows[i]) for i in pending if is_predictable(rows[i])}
@@ -102,10 +102,10 @@ def _grouped(tasks: Sequence[Task]) -> Task:
 
 def _field_task(job: Job, groups: BlockGroups, projected_bytes: float) -> Task:
     """Return the task that computes and stores a field, after those that it depends on; it gives the record."""
-    needs_gpu = job.backend == "gpu"
+    needs_gpu = job.plan.study.backend == "gpu"
     if len(groups) == 1:
         return Task(compute_mesh, (job, *groups), projected_bytes, needs_gpu, job.row, job.planned.label, stage="field")
-    parts = [(blocks, False) for blocks in groups] + [((), True)] * (job.tail is not None)
+    parts = [(blocks, False) for blocks in groups] + [((), True)] * (job.plan.tail is not None)
     label, stage = job.planned.label, "part of field"
     tasks = [Task(compute_parts, (job, *part), projected_bytes, needs_gpu, label=label, stage=stage) for part in parts]
     return Task(finish_mesh, (job, *tasks), row=job.row, label=label, stage="field")

@@ -7,7 +7,6 @@ import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.workers import this_worker, worker_backend
 from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, naming, one_line
 from sobolev_batch.geometry.surface import Similarity, Surface
-from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, field_for
 from sobolev_batch.norms.tail.remainder import Remainder, remainder, remainder_between, remainder_of_flat
 from sobolev_batch.norms.tail.sampling import TailSampling
@@ -26,17 +24,15 @@ from sobolev_batch.store.layout import Store
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.records import Facts, Record, Records
 from sobolev_batch.study.plan import Plan, Row
-from sobolev_batch.transform.backends import Backends
 from sobolev_batch.transform.fourier import (
     NUMERICS_VERSION,
     ErrorTarget,
     Execution,
-    TransformSettings,
     choose_settings,
     transform_block,
 )
 from sobolev_batch.transform.kinds import kind_of
-from sobolev_batch.transform.lattice import Block, Lattice
+from sobolev_batch.transform.lattice import Block
 from sobolev_batch.transform.probe import COMMON, Probe, draws_for, join, probe_block
 
 _log = logging.getLogger(__name__)
@@ -54,8 +50,7 @@ class Job:
 
     Attributes:
         row, planned: Row of the store, and what the plan has for it.
-        lattice, transform, orders, similarity, backend, tail: What all rows share; see `Plan`.
-        distance_target: Accuracy that the field is computed for, if the study has one.
+        plan: What all rows share; see `Plan.without_surfaces`.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
         reference: The reference, where surfaces are compared beyond the lattice; None if it is too large.
         numerics: Version of the numerics that the key of the row has.
@@ -64,13 +59,7 @@ class Job:
     store: Store
     row: int
     planned: Row
-    lattice: Lattice
-    transform: TransformSettings
-    orders: tuple[float, ...]
-    similarity: Similarity
-    backend: Backends = "auto"
-    tail: TailSampling | None = None
-    distance_target: DistanceTarget | None = None
+    plan: Plan
     allowed_bytes: float | None = None
     reference: Row | None = None
     numerics: int = NUMERICS_VERSION
@@ -81,18 +70,10 @@ class Job:
         is_same = self.numerics == NUMERICS_VERSION
         return self.planned.key if is_same else f"{self.planned.key} by numerics {NUMERICS_VERSION}"
 
-    @classmethod
-    def for_row(
-        cls, plan: Plan, one: Row, store: Store, row: int, allowed: float | None = None, reference: Row | None = None
-    ) -> Self:
-        """Return the job of a row of a plan."""
-        shared = plan.lattice, plan.transform, plan.study.orders, plan.similarity, plan.study.backend, plan.tail
-        return cls(store, row, one, *shared, plan.distance_target(one), allowed, reference)
-
     @property
     def execution(self) -> Execution:
         """Execution of the transforms on this worker."""
-        return Execution(worker_backend(self.backend), allowed_bytes=self.allowed_bytes)
+        return Execution(worker_backend(self.plan.study.backend), allowed_bytes=self.allowed_bytes)
 
     def load(self) -> Surface:
         """Load the surface, in the study's unit; MeshError where it is not the one that the study was planned with."""
@@ -102,7 +83,7 @@ class Job:
         """Load the reference, in the study's unit; None where it is too large. See `load` for errors."""
         if self.reference is None:
             return None
-        key = self.reference.fingerprint, self.similarity
+        key = self.reference.fingerprint, self.plan.similarity
         if (kept := _reference.get(key)) is not None:
             return kept
         _reference.clear()
@@ -113,16 +94,15 @@ class Job:
         return found
 
     def _loaded(self, one: Row) -> Surface:
-        surface = self.similarity.apply(one.member.load())
+        surface = self.plan.similarity.apply(one.member.load())
         if one.fingerprint and one.member.fingerprint_digest() != one.fingerprint:
             raise MeshError("a file of it was changed while the study was going on; run the study again")
         return surface
 
     def error_target(self, surface: Surface) -> ErrorTarget | None:
         """Return the target for the errors of a surface's values; None where the settings alone count."""
-        if self.distance_target is None or kind_of(surface).is_closed_form:
-            return None
-        return self.distance_target.error_target(surface)
+        target = self.plan.distance_target(self.planned)
+        return None if target is None or kind_of(surface).is_closed_form else target.error_target(surface)
 
     def stored_record(self) -> Record | None:
         """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""
@@ -132,7 +112,7 @@ class Job:
     def failure_reason(self, error: Exception) -> str:
         """Return why the mesh failed, in one line, and log the traceback where its input is not to blame."""
         reason = one_line(error)
-        if isinstance(error, LatticeError) and self.distance_target is not None:
+        if isinstance(error, LatticeError) and self.plan.study.accuracy is not None:
             reason = (
                 f"{reason}; it was chosen for surfaces that reach less far. Is this one in the same unit of length? "
                 "If it is, name another store, for which the lattice is chosen anew"
@@ -166,7 +146,7 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
 
     The reason of a failure goes into the record, so that one bad mesh stops nothing else; but for a StoreError.
     """
-    stored = compute_parts(job, blocks, octaves=job.tail is not None)
+    stored = compute_parts(job, blocks, octaves=job.plan.tail is not None)
     return stored if isinstance(stored, Record) else _finished(job, stored)
 
 
@@ -177,16 +157,16 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
     """
     if record := job.stored_record():
         return record
-    started = time.perf_counter()
+    started, tail, first = time.perf_counter(), job.plan.tail, job.plan.lattice.half.start
     try:
         # Another worker that computes them again must write the same bytes. Octaves take long enough for loops to pay.
-        with compiled.by_itself(loops=job.tail is not None):
+        with compiled.by_itself(loops=tail is not None):
             surface = job.load()
             target = job.error_target(surface)
             stored = [_store_blocks(job, surface, blocks, target)] if blocks else []
-            if octaves and job.tail is not None:
-                stored.append(_store_octaves(job, job.tail, surface, target))
-            elif blocks and blocks[0].start == job.lattice.half.start and (quality := stored[0].quality) is not None:
+            if octaves and tail is not None:
+                stored.append(_store_octaves(job, tail, surface, target))
+            elif blocks and blocks[0].start == first and (quality := stored[0].quality) is not None:
                 stored[0] = replace(stored[0], quality=replace(quality, beyond=_beyond_lattice(job, surface)))
     except StoreError:
         raise
@@ -202,8 +182,8 @@ def finish_mesh(job: Job, *parts: list[StoredBlocks] | Record) -> Record:
 
 
 def _store_octaves(job: Job, tail: TailSampling, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
-    settings = target.tightened(_OCTAVES_TIGHTENING) if target else job.transform
-    values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
+    settings = target.tightened(_OCTAVES_TIGHTENING) if target else job.plan.transform
+    values = [octave_values(surface, octave, job.plan.study.orders, settings, job.execution) for octave in tail.octaves]
     cutoff, difference = tail.highest_frequency, None
     if (reference := job.load_reference()) is not None:
         difference = remainder_between((surface, reference), cutoff, execution=job.execution)
@@ -220,8 +200,8 @@ def _store_octaves(job: Job, tail: TailSampling, surface: Surface, target: Error
 
 def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
     """Return what lies beyond a lattice in the distance from the reference; None where it is extrapolated."""
-    cutoff = job.lattice.xi_max
-    if job.reference is None or job.tail is not None:
+    cutoff = job.plan.lattice.xi_max
+    if job.reference is None or job.plan.tail is not None:
         return None
     if job.reference.label == job.planned.label:
         return Remainder.alike(cutoff)
@@ -230,11 +210,11 @@ def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
 
 
 def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
-    lattice, transform, execution = job.lattice, job.transform, job.execution
+    lattice, transform, execution = job.plan.lattice, job.plan.transform, job.execution
     if target:
         field = field_for(surface, lattice, target, transform, execution, lasting=True)
     else:
-        field = compute_field(surface, lattice, transform, job.orders, execution, lasting=True)
+        field = compute_field(surface, lattice, transform, job.plan.study.orders, execution, lasting=True)
     checksum = Fields(job.store).write(job.row, lattice.half.place_in(lattice.half), field.values)
     facts = Facts.of_surface(surface, field.points)
     return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
@@ -242,12 +222,12 @@ def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> Stor
 
 def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: ErrorTarget | None) -> StoredBlocks:
     """Compute and store blocks; the settings of one of several follow from their a priori error."""
-    lattice, execution = job.lattice, job.execution
+    lattice, execution = job.plan.lattice, job.execution
     if tuple(blocks) == (lattice.half,):
         return _store_whole(job, surface, target)
-    transform = choose_settings(surface, lattice, target, job.transform) if target else job.transform
+    transform = choose_settings(surface, lattice, target, job.plan.transform) if target else job.plan.transform
     kind = transform.kind_for(surface, lattice)
-    draws = draws_for([surface], lattice, job.orders, kind.lowest_degree, COMMON, lasting=True)
+    draws = draws_for([surface], lattice, job.plan.study.orders, kind.lowest_degree, COMMON, lasting=True)
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
         result = transform_block(surface, lattice, block, transform, execution, kind)

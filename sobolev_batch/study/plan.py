@@ -116,6 +116,10 @@ class Plan:
         rows = (replace(row, key=key, is_chosen=row.is_chosen or row.label in also) for row, key in keyed)
         return replace(self, rows=tuple(rows), choice=choice)
 
+    def without_surfaces(self) -> Self:
+        """Return what the tasks of all surfaces need of the plan: they take it along, each a surface of its own."""
+        return replace(self, study=replace(self.study, objects={}, table={}, cache=None), rows=(), look=Look())
+
 
 def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan:
     """Plan a study of one object: list its surfaces, choose its similarity and lattice, identify every field.

@@ -23,7 +23,6 @@ from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.field_costs import size_tasks
 from sobolev_batch.batch.field_tasks import Job, compute_mesh, compute_parts, finish_mesh
 from sobolev_batch.errors import ClusterError
-from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.norms.tail.sampling import Octave
@@ -47,7 +46,7 @@ FINE = small_table(family=[{"name": "ico", "source": "icosphere", "levels": [0, 
 
 def job_of(plan: Plan, store_path: Path, label: str = "ico/5", allowed_bytes: float | None = None) -> Job:
     row = next(row for row in plan.rows if row.label == label)
-    return Job.for_row(plan, row, prepare_store(store_path, plan), 0, allowed_bytes)
+    return Job(prepare_store(store_path, plan), 0, row, plan, allowed_bytes)
 
 
 def test_a_mesh_is_one_task_whatever_the_memory_allows(store_path: Path) -> None:
@@ -72,8 +71,9 @@ def test_octaves_have_the_precision_that_their_own_accuracy_needs(store_path: Pa
     precisions: tuple[ComplexDtype, ...] = ("complex64", "complex128")
     for precision in precisions:
         for distance, expected in ((1.0, "complex64"), (1e-6, "complex128")):
-            target = DistanceTarget((-2.0,), Accuracy(0.1), None, (distance,))
-            both = replace(job, transform=TransformSettings(dtype=precision), distance_target=target)
+            choice = replace(job.plan.choice, transform_dtype=precision, closest=(distance,))
+            study = replace(job.plan.study, orders=(-2.0,), accuracy=Accuracy(0.1))
+            both = replace(job, plan=replace(job.plan, study=study, choice=choice, reference=job.planned.label))
             mesh = job.load()
             permitted = both.error_target(mesh)
             assert permitted is not None
@@ -93,7 +93,7 @@ def test_what_a_mesh_and_its_reference_cover_is_nothing_beyond_the_octaves(tmp_p
     }
     plan = make_plan(Study.from_table(small_table(**table), folder=tmp_path))
     reference, row = (next(row for row in plan.rows if row.label == label) for label in ("reference", "plates/anew"))
-    job = Job.for_row(plan, row, prepare_store(tmp_path / "store.zarr", plan), 0, None, reference)
+    job = Job(prepare_store(tmp_path / "store.zarr", plan), 0, row, plan, None, reference)
     stored = compute_parts(job, octaves=True)
     # The next task takes the same one.
     assert job.load_reference() is job.load_reference()

@@ -263,7 +263,7 @@ sys.stdin.readline()
 for i, row in Workspace.for_plan(store, plan).rows.items():
     if row.label == "reference":
         continue
-    job = Job.for_row(plan, row, store, i)
+    job = Job(store, i, row, plan)
     for _ in range(5):
         Records(store).write(i, None)
         assert compute_mesh(job, plan.blocks).status == "complete"
