@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from sobolev_batch import compiled
-from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, in_place, result_from
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, carried_out, result_from
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.field_costs import is_predictable, row_seconds, size_rows
 from sobolev_batch.batch.field_stage import compute_fields
@@ -179,7 +179,7 @@ def begin(study: Study, location: Location, workers: Workers | None) -> Begun | 
         return before, {}
     if workers is None or not _is_small(workspace, workers):
         return workspace
-    ended = in_place(_compute(Cluster(None, workers), workspace))
+    ended = carried_out(_compute(Cluster(None, workers), workspace))
     records = dict(zip(workspace.labels, Records(workspace.store).read(), strict=True))
     return ended, {label: records[label] for label in ended.computed}
 

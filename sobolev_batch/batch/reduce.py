@@ -15,9 +15,9 @@ from distributed import Client
 from pydantic import ValidationError
 
 from sobolev_batch.batch.cluster.clients import check_cluster, local_client
-from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, in_place, result_from, side_by_side, wait_for
-from sobolev_batch.batch.cluster.workers import prepare_workers
-from sobolev_batch.errors import ClusterError, InputError, MeshError, SobolevBatchError, one_line
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, result_from, side_by_side, wait_for
+from sobolev_batch.batch.cluster.workers import Workers, prepare_workers
+from sobolev_batch.errors import ClusterError, InputError, MeshError, one_line
 from sobolev_batch.geometry.formats.by_name import WRITERS, mesh_format
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
@@ -236,21 +236,15 @@ def _outcomes(
     searches: Sequence[RecordedSearch], client: Client | None, workers: int | None
 ) -> Iterator[tuple[str, Reduction | Exception]]:
     processes = available_cores() if workers is None else workers
-    if client is None and (processes == 1 or (workers is None and len(searches) == 1 and _is_small(searches[0]))):
-        for search in searches:
-            try:
-                yield search.name, in_place(_searched(search, lambda: None, lambda: 1))
-            except SobolevBatchError as error:
-                if ends_all(error):
-                    raise
-                yield search.name, error
-        return
+    here = client is None and (processes == 1 or (workers is None and len(searches) == 1 and _is_small(searches[0])))
     left = {search.name for search in searches}
     with ExitStack() as stack:
 
         @cache
         def cluster() -> Cluster:
             """Start the cluster, which is not needed where everything is recorded."""
+            if here:
+                return Cluster(None, Workers.of_this_machine(1))
             started = client or stack.enter_context(local_client(min(processes, _MOST_AT_ONCE * len(searches))))
             return Cluster(started, prepare_workers(started, searches[0].remesher.source.libraries), study="reduce")
 
@@ -274,8 +268,8 @@ def _is_small(search: RecordedSearch) -> bool:
     return True
 
 
-def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Callable[[], int]) -> Stages[Reduction]:
-    """Search for the fewest triangles of a mesh, on a cluster or, where that is None, in this process."""
+def _searched(search: RecordedSearch, cluster: Callable[[], Cluster], at_once: Callable[[], int]) -> Stages[Reduction]:
+    """Search for the fewest triangles of a mesh."""
     if (known := search.recorded()) is None:
         search.make_room()
         read = Task(search.begun, (), search.projected_bytes(0), label=search.name, stage="read")

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib.util import find_spec
@@ -11,7 +11,7 @@ from distributed import Client
 
 from sobolev_batch.batch import object_run
 from sobolev_batch.batch.cluster.clients import check_cluster, local_client, memory_limit, thread_client
-from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress, Stages, side_by_side
+from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress, Stages, carried_out, side_by_side
 from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.object_run import Ended
@@ -27,7 +27,6 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked, utc_now
 from sobolev_batch.store.objects import Objects, ends_all, labelled
 from sobolev_batch.store.records import ObjectRecord
-from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.tables.all_objects import write_all
 from sobolev_batch.visible import visible
@@ -134,50 +133,40 @@ def run(
     require_usable(location, of_objects="" not in study.objects)
     with ExitStack() as stack:
 
-        @cache
-        def start() -> tuple[Client, Watch]:
-            """Start the cluster of all objects, which is not needed where nothing is missing."""
-            own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
-            started = stack.enter_context(own)
-            return started, stack.enter_context(Watch(started, study.backend == "gpu").kept())
-
-        def equip() -> tuple[Cluster, Watch]:
-            started, watch = start()
+        def start() -> Client:
+            own = client is None
+            started = stack.enter_context(_own_cluster(study, location, workers, memory)) if own else client
             # Without bokeh, a cluster of this process has a page that says no more than that.
-            if client is not None or find_spec("bokeh"):
+            if not own or find_spec("bokeh"):
                 notify(Progress("cluster", 0, 0, started.dashboard_link))
             families = (family for one in study.objects.values() for family in one.families)
             if searched := dict.fromkeys(one.name for one in families if isinstance(one.source, SearchedSource)):
                 notify(Progress("search", 0, 0, ", ".join(searched)))
-            return Cluster(started, prepare_workers(started, study.libraries), study=study.name), watch
+            return started
 
         with locked(location, lock):
             if client is not None:
-                require_store_access(start()[0], location, lock)
+                with Watch(client).kept():
+                    require_store_access(client, location, lock)
             try:
-                return carry_out(study, location, lock, equip, notify)
+                return carry_out(study, location, lock, start, notify)
             except SobolevBatchError:
                 give_up(lock.fenced(location))
                 raise
 
 
 def carry_out(
-    study: Study,
-    location: Location,
-    lock: Lock,
-    equip: Callable[[], tuple[Cluster, Watch]],
-    notify: Notify = lambda progress: None,
+    study: Study, location: Location, lock: Lock, start: Callable[[], Client], notify: Notify = lambda progress: None
 ) -> Summary:
-    """Run a study in a store that this process has locked; a cluster is asked for once, if anything is missing.
+    """Run a study in a store that this process has locked; a client is asked for once, if anything is missing.
 
     What ends the run of an only object without a name is raised, and what ends those of all objects.
     """
-    place, numbers = lock.fenced(location), {name: n for n, name in enumerate(study.objects, 1)}
-    equip, at_hand = cache(equip), None
+    place, numbers, at_hand = lock.fenced(location), {name: n for n, name in enumerate(study.objects, 1)}, None
     objects = None if "" in study.objects else Objects.prepared(place, study)
     if objects is None and (at_hand := object_run.workspace_at_hand(study, place)) is None:
         reserve(place, study.title)
-    with Heartbeat(location, lock).kept() as heartbeat:
+    with Heartbeat(location, lock).kept() as heartbeat, ExitStack() as stack:
 
         def beat(name: str, progress: Progress) -> None:
             part = f"{name}, {numbers[name]} of {len(numbers)}" if name else ""
@@ -185,27 +174,27 @@ def carry_out(
             heartbeat.advance(f"{begin}{progress.stage}, {progress.done} of {progress.total}")
             notify(replace(progress, part=part))
 
-        def cluster_of(name: str) -> Cluster:
-            cluster, heartbeat.watch = equip()
+        @cache
+        def cluster() -> Cluster:
+            client = start()
+            heartbeat.watch = stack.enter_context(Watch(client, study.backend == "gpu").kept())
+            workers = prepare_workers(client, study.libraries)
             # This is asked before anything is computed: tasks would wait for a GPU that nobody has.
-            cluster.workers.with_backend(study.backend).require_accuracy(study.accuracy)
-            return replace(cluster, notify=partial(beat, name), part=name)
+            workers.with_backend(study.backend).require_accuracy(study.accuracy)
+            return Cluster(client, workers, study=study.name)
+
+        def cluster_of(name: str) -> Cluster:
+            return replace(cluster(), notify=partial(beat, name), part=name)
 
         if objects is None:
-            return _summary(location, {"": _only(study, place, cluster_of, at_hand)})
+            if at_hand is None or (ended := object_run.ended_already(at_hand)) is None:
+                ended = carried_out(object_run.run_object(study, place, cluster_of(""), at_hand))
+            return _summary(location, {"": ended})
         runs = _Runs(study, place, objects, cluster_of)
         for name, outcome in side_by_side(runs.begun(), ends_all):
             runs.end(name, outcome)
         runs.tabulate()
     return _summary(location, {name: runs.ended[name] for name in study.objects if name in runs.ended})
-
-
-def _only(study: Study, place: Location, cluster_of: Callable[[str], Cluster], at_hand: Workspace | None) -> Ended:
-    """Run a study of an only object without a name, in its workspace where that is at hand."""
-    if at_hand is not None and (before := object_run.ended_already(at_hand)) is not None:
-        return before
-    runs = [("", object_run.run_object(study, place, cluster_of(""), at_hand))]
-    return next(ended for _, ended in side_by_side(runs, is_fatal=lambda error: True) if isinstance(ended, Ended))
 
 
 class _Runs:

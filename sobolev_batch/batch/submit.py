@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
 from sobolev_batch.batch.cluster.clients import require_blocking
-from sobolev_batch.batch.cluster.execution import Cluster, task_key
+from sobolev_batch.batch.cluster.execution import task_key
 from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.run import carry_out
@@ -128,12 +128,8 @@ def drive(study: Study, store: str, run: str) -> None:
             _log.warning("%s: the store was unlocked since the study was submitted, or is done; left alone", store)
             return
         acquire(location, lock)
-        with worker_client() as client, Watch(client, study.backend == "gpu").kept() as watch:
-
-            def equip() -> tuple[Cluster, Watch]:
-                return Cluster(client, prepare_workers(client, study.libraries), study=study.name), watch
-
-            carry_out(study, location, lock, equip)
+        with worker_client() as client:
+            carry_out(study, location, lock, lambda: client)
     except Exception as error:
         if get_worker().status != Status.running:
             # Dask has another worker drive, which takes the lock over.

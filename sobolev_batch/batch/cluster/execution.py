@@ -5,7 +5,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar, cast
 from uuid import uuid4
 
 from distributed import CancelledError, Client, Future, as_completed
@@ -106,7 +106,7 @@ class Cluster:
     """A cluster that computes a study.
 
     Attributes:
-        client: Client of the cluster; None where one task does all the work itself, see `in_place`.
+        client: Client of the cluster; None where this process does the tasks itself, one after the other.
         workers: Workers that the cluster had when the study began.
         study, part: Name of the study, and of its object where it names any, for the names of tasks.
     """
@@ -175,23 +175,6 @@ def result_from(cluster: Cluster, task: Task) -> Stages[Any]:
     return found[0]
 
 
-def in_place(stages: Stages[Result]) -> Result:
-    """Carry a run out where this is called, one task after the other, and return its result."""
-    error: Exception | None = None
-    try:
-        while True:
-            wave = next(stages) if error is None else stages.throw(error)
-            error = None
-            try:
-                for task in wave.tasks:
-                    wave.take(task, *outcomes_here([task]))
-            except Exception as failure:
-                error = failure
-    except StopIteration as end:
-        result: Result = end.value
-        return result
-
-
 def outcomes_here(tasks: Sequence[Task]) -> list[Any]:
     """Do tasks one after the other, and return the result of each, or its exception; a StoreError ends it."""
 
@@ -230,6 +213,12 @@ def side_by_side(
     yield from _Loop(iter(runs), is_fatal).outcomes()
 
 
+def carried_out(stages: Stages[Result]) -> Result:
+    """Carry a single run out, and return its result; see `side_by_side`."""
+    ((_, outcome),) = side_by_side([("", stages)], is_fatal=lambda error: True)
+    return cast(Result, outcome)
+
+
 class _Run(Generic[Result]):
     """A run that has begun: the wave that it waits for, tasks of this to hand out, and their number on the cluster."""
 
@@ -260,9 +249,9 @@ class _Loop(Generic[Result]):
         try:
             while True:
                 self._hand_out()
-                while self._ended:
+                if self._ended:
                     yield self._ended.popleft()
-                if self._running:
+                elif self._running:
                     self._take_back()
                 elif not self._ready and not self._try_alone():
                     break
@@ -279,8 +268,11 @@ class _Loop(Generic[Result]):
                 future.release()
 
     def _hand_out(self) -> None:
-        """Submit tasks of all runs in turn, up to what the scheduler should know of; begin runs where none has any."""
-        while self._alone is None and (self._ready or self._begin()):
+        """Submit tasks of all runs in turn, up to what the scheduler should know of; begin runs where none has any.
+
+        Where nothing is running meanwhile, as without a cluster, what has ended is told first.
+        """
+        while self._alone is None and (self._running or not self._ended) and (self._ready or self._begin()):
             if not self._ready:
                 continue
             run = self._ready[0]
@@ -310,6 +302,12 @@ class _Loop(Generic[Result]):
 
     def _submit(self, run: _Run[Result], task: Task) -> None:
         cluster = run.wave.cluster
+        if cluster.client is None:
+            try:
+                run.wave.take(task, *outcomes_here([task]))
+            except Exception as error:
+                self._end_wave(run, error)
+            return
         try:
             cluster.workers.require_memory(task.projected_bytes)
         except ClusterError as error:

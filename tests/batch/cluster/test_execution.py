@@ -22,7 +22,6 @@ from sobolev_batch.batch.cluster.execution import (
     Task,
     Wave,
     describe_failure,
-    in_place,
     result_of,
     side_by_side,
 )
@@ -168,8 +167,8 @@ def test_a_group_whose_worker_died_is_divided(cluster: Cluster, monkeypatch: pyt
     assert sorted(outcomes) == [(1, "1"), (2, "2")]
 
 
-def test_a_run_in_place_is_the_same(cluster: Cluster) -> None:
-    seen: list[Any] = []
+def test_a_run_in_place_is_the_same_and_told_before_the_next_begins() -> None:
+    seen, cluster = list[Any](), Cluster(None, Workers.of_this_machine(1))
 
     def stages() -> Stages[str]:
         tasks = [Task(abs, (-1,)), Task(_total, (Task(abs, (-2,)), 3)), Task(_fail, (ValueError("bad mesh"),))]
@@ -180,9 +179,9 @@ def test_a_run_in_place_is_the_same(cluster: Cluster) -> None:
             return str(error)
         return ""
 
-    assert in_place(stages()) == "disk full"
+    assert next(side_by_side([("first", stages()), ("second", stages())])) == ("first", "disk full")
     assert seen[:2] == [1, 5]
-    assert str(seen[2]) == "bad mesh"
+    assert [str(one) for one in seen[2:]] == ["bad mesh"]
 
 
 def _fail(error: Exception) -> None:
