@@ -39,23 +39,22 @@ _GROUP = "proximity"
 
 def have_proximities(workspace: Workspace) -> bool:
     """Return True where the store has all distances that the study requests, and readers find them."""
-    attributes, requested = table_attributes(workspace.store, _GROUP), workspace.plan.study.proximity
-    if requested is None:
-        return attributes is None
-    is_listed = attributes is not None and attributes.get("digest") == _digest(workspace, requested)
-    return is_listed and not _pending(workspace)
+    attributes, table = table_attributes(workspace.store, _GROUP), _table(workspace)
+    if attributes is None or table is None:
+        return attributes is table
+    return bool(attributes.get("digest") == table.attrs["digest"]) and not _pending(workspace)
 
 
 def measure_proximities(cluster: Cluster, workspace: Workspace) -> Stages[None]:
     """Measure the distances that the records lack, and write their table, or remove one that nobody requests."""
-    requested, pending = workspace.plan.study.proximity, _pending(workspace)
-    if requested is not None and pending:
+    requested = workspace.plan.study.proximity
+    if requested is not None and (pending := _pending(workspace)):
         yield from _measure(cluster, workspace, requested, pending)
     if have_proximities(workspace):
         return
     workspace.store.remove(_GROUP)
-    if requested is not None:
-        write_table(workspace.store, _GROUP, _dataset(workspace, requested))
+    if (table := _table(workspace)) is not None:
+        write_table(workspace.store, _GROUP, table)
         workspace.store.consolidate()
 
 
@@ -157,29 +156,25 @@ def _pending(workspace: Workspace) -> dict[int, str]:
     return {i: key for i, (key, record) in _requested(workspace).items() if record is None or record.reason}
 
 
-def _current(workspace: Workspace) -> list[tuple[str, ProximityRecord | None]]:
-    """Return the labels of the meshes in the order of tables, and the distances that belong to what they are now."""
+def _table(workspace: Workspace) -> xr.Dataset | None:
+    """Return the numbers of `proximity` (mesh), and `reason` where they are NaN; None where none are requested.
+
+    They are in the order of tables, of the meshes as they are now, with a digest of all records.
+    """
+    if (requested := workspace.plan.study.proximity) is None:
+        return None
     measured = _requested(workspace)
-    return [(workspace.labels[i], measured.get(i, ("", None))[1]) for i, _, _ in table_order(workspace)]
-
-
-def _dataset(workspace: Workspace, requested: ProximitySection) -> xr.Dataset:
-    """Return the numbers of `proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
-    labels, records = zip(*_current(workspace), strict=True)
-    measured = [record.numbers if record else {} for record in records]
-    columns: dict[str, Any] = {name: [one.get(name, np.nan) for one in measured] for name in proximity.NUMBERS}
-    columns["reason"] = np.array([record.reason if record else "" for record in records], dtype=object)
+    records = {workspace.labels[i]: measured.get(i, ("", None))[1] for i, _, _ in table_order(workspace)}
+    numbers = [record.numbers if record else {} for record in records.values()]
+    columns: dict[str, Any] = {name: [one.get(name, np.nan) for one in numbers] for name in proximity.NUMBERS}
+    columns["reason"] = np.array([record.reason if record else "" for record in records.values()], dtype=object)
+    lines = [[label, record and asdict(record)] for label, record in records.items()]
     attributes = {
         "reference": workspace.plan.reference,
         "points": requested.points,
         "metrics": list(requested.metrics),
-        "digest": _digest(workspace, requested),
+        "digest": digest_of([requested.metrics, lines]),
     }
     variables = {name: ("mesh", values) for name, values in columns.items()}
-    table = xr.Dataset(variables, coords={"mesh": np.array(labels, dtype=object)}, attrs=attributes)
+    table = xr.Dataset(variables, coords={"mesh": np.array([*records], dtype=object)}, attrs=attributes)
     return describe(table.set_coords("reason"))
-
-
-def _digest(workspace: Workspace, requested: ProximitySection) -> str:
-    lines = [[label, record and asdict(record)] for label, record in _current(workspace)]
-    return digest_of([requested.metrics, lines])

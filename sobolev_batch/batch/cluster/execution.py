@@ -282,7 +282,7 @@ class _Loop(Generic[Result]):
             try:
                 task = next(run.tasks, None)
             except Exception as error:
-                self._end_wave(run, error)
+                self._advance(run, error)
                 continue
             if task is not None:
                 self._submit(run, task)
@@ -306,7 +306,7 @@ class _Loop(Generic[Result]):
             try:
                 run.wave.take(task, *outcomes_here([task]))
             except Exception as error:
-                self._end_wave(run, error)
+                self._advance(run, error)
             return
         try:
             cluster.workers.require_memory(task.projected_bytes)
@@ -324,13 +324,11 @@ class _Loop(Generic[Result]):
     def _take_back(self) -> None:
         # Others were given up.
         batch = [future for future in self._completed.next_batch() if future in self._running]
-        runs: dict[_Run[Result], None] = {}
         for future, outcome in zip(batch, _outcomes(batch), strict=True):
             if future not in self._running:
                 continue  # An outcome before this one ended the wave.
             run, task = self._running.pop(future)
             run.in_flight -= 1
-            runs[run] = None
             if was_alone := task is self._alone:
                 self._alone = None
             if not isinstance(outcome, KilledWorker):
@@ -348,7 +346,6 @@ class _Loop(Generic[Result]):
                 self._give(run, task, ClusterError(reason))
             else:
                 run.suspects.append(task)
-        for run in runs:
             self._go_on(run)
 
     def _give(self, run: _Run[Result], task: Task, outcome: Any) -> None:
@@ -359,25 +356,22 @@ class _Loop(Generic[Result]):
                 raise outcome
             run.wave.take(task, outcome)
         except Exception as error:
-            self._end_wave(run, error)
-
-    def _end_wave(self, run: _Run[Result], error: Exception) -> None:
-        """Give the other tasks of a run up, and raise an error where it waits."""
-        for future in [future for future, (owner, _) in self._running.items() if owner is run]:
-            del self._running[future]
-            future.release()
-        run.in_flight = 0
-        run.suspects.clear()
-        if run in self._ready:
-            self._ready.remove(run)
-        self._advance(run, error)
+            self._advance(run, error)
 
     def _go_on(self, run: _Run[Result]) -> None:
         if run in self._begun and not (run in self._ready or run.in_flight or run.suspects):
             self._advance(run)
 
     def _advance(self, run: _Run[Result], error: Exception | None = None) -> None:
-        """Have a run yield its next wave, or end. An error is raised where it waits."""
+        """Have a run yield its next wave, or end. An error is raised where it waits; its other tasks are given up."""
+        if error is not None:
+            for future in [future for future, (owner, _) in self._running.items() if owner is run]:
+                del self._running[future]
+                future.release()
+        run.in_flight = 0
+        run.suspects.clear()
+        with suppress(ValueError):
+            self._ready.remove(run)
         try:
             run.wave = next(run.stages) if error is None else run.stages.throw(error)
         except StopIteration as end:
