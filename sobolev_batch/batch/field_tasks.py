@@ -14,7 +14,7 @@ from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.workers import this_worker, worker_backend
 from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, naming, one_line
 from sobolev_batch.geometry.surface import Similarity, Surface
-from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, field_for
+from sobolev_batch.norms.fields import Quality, TailQuality, field_for
 from sobolev_batch.norms.tail.remainder import Remainder, remainder, remainder_between, remainder_of_flat
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.norms.tail.values import octave_values
@@ -209,22 +209,14 @@ def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
     return None if reference is None else remainder_of_flat((surface, reference), cutoff, execution=job.execution)
 
 
-def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
-    lattice, transform, execution = job.plan.lattice, job.plan.transform, job.execution
-    if target:
-        field = field_for(surface, lattice, target, transform, execution, lasting=True)
-    else:
-        field = compute_field(surface, lattice, transform, job.plan.study.orders, execution, lasting=True)
-    checksum = Fields(job.store).write(job.row, lattice.half.place_in(lattice.half), field.values)
-    facts = Facts.of_surface(surface, field.points)
-    return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
-
-
 def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: ErrorTarget | None) -> StoredBlocks:
     """Compute and store blocks; the settings of one of several follow from their a priori error."""
     lattice, execution = job.plan.lattice, job.execution
-    if tuple(blocks) == (lattice.half,):
-        return _store_whole(job, surface, target)
+    if target and tuple(blocks) == (lattice.half,):
+        whole = field_for(surface, lattice, target, job.plan.transform, execution, lasting=True)
+        checksum = Fields(job.store).write(job.row, lattice.half.place_in(lattice.half), whole.values)
+        facts = Facts.of_surface(surface, whole.points)
+        return StoredBlocks(facts, quality=whole.quality, checksums=(checksum,), backends=(whole.backend,))
     transform = choose_settings(surface, lattice, target, job.plan.transform) if target else job.plan.transform
     kind = transform.kind_for(surface, lattice)
     draws = draws_for([surface], lattice, job.plan.study.orders, kind.lowest_degree, COMMON, lasting=True)
