@@ -15,7 +15,7 @@ from typing import Any, TypeGuard, TypeVar, cast
 from pydantic import TypeAdapter, ValidationError
 
 from sobolev_batch.errors import DamageError
-from sobolev_batch.sources.names import node_problem
+from sobolev_batch.sources.names import node_problem, quoted
 
 # The layout that docs/store.md describes has this version.
 SCHEMA_VERSION = 17
@@ -65,7 +65,7 @@ def attributes_of(root: Document) -> dict[str, Any]:
     """Return the attributes of a root as it is stored, with its mappings; ValueError where one is none."""
     attributes: dict[str, Any] = root.get("attributes", {})
     if not isinstance(attributes.get("removed", []), list):
-        raise ValueError(f"the meshes that are removed are {_shown(attributes['removed'])}")
+        raise ValueError(f"the meshes that are removed are {quoted(attributes['removed'])}")
     return attributes | {name: mapping_in(attributes[name]) for name in _TABLES if name in attributes}
 
 
@@ -106,15 +106,15 @@ def problems_of(documents: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 def _problem(name: str, document: Any) -> str:
     parts = name.split("/")  # a group, or an array in one
     if name and (len(parts) > 2 or any(map(node_problem, parts))):
-        return f"a node is named {_shown(name)}"
+        return f"a node is named {quoted(name)}"
     node = name or "the root"
     if not isinstance(document, dict):
         return f"the metadata of {node} are no table"
     kind = document.get("node_type")
     if document.get("zarr_format") != 3 or kind != ("array" if "/" in name else "group"):
-        return f"{node} is {_shown(kind)} of zarr format {_shown(document.get('zarr_format'))}"
+        return f"{node} is {quoted(kind)} of zarr format {quoted(document.get('zarr_format'))}"
     if unknown := set(document) - (_GROUP_KEYS if kind == "group" else _ARRAY_KEYS):
-        return f"{node} has metadata {_shown(min(unknown))}"
+        return f"{node} has metadata {quoted(min(unknown))}"
     if not isinstance(document.get("attributes", {}), dict):
         return f"the attributes of {node} are no table"
     if kind == "array":
@@ -122,36 +122,31 @@ def _problem(name: str, document: Any) -> str:
     consolidated = document.get("consolidated_metadata") or {"kind": "inline", "metadata": {}}
     nodes = consolidated.get("metadata") if isinstance(consolidated, dict) else None
     if not isinstance(nodes, dict) or consolidated.get("kind") != "inline":
-        return f"the consolidated metadata of {node} are {_shown(consolidated)}"
+        return f"the consolidated metadata of {node} are {quoted(consolidated)}"
     return "a node is named ''" if "" in nodes else ""
 
 
 def _problem_of_array(node: str, document: Document) -> str:
     if document.get("data_type") not in _DATA_TYPES:
-        return f"the data type of {node} is {_shown(document.get('data_type'))}"
+        return f"the data type of {node} is {quoted(document.get('data_type'))}"
     codecs = document.get("codecs")
     for codec in codecs if codecs and isinstance(codecs, list) else [codecs or None]:
         codec = codec.get("name") if isinstance(codec, dict) else codec
         if codec not in _CODECS:
-            return f"the codec of {node} is {_shown(codec)}"
+            return f"the codec of {node} is {quoted(codec)}"
     if document.get("storage_transformers"):
-        return f"{node} has the storage transformers {_shown(document['storage_transformers'])}"
+        return f"{node} has the storage transformers {quoted(document['storage_transformers'])}"
     for key, expected in (("chunk_grid", "regular"), ("chunk_key_encoding", "default")):
         if not isinstance(value := document.get(key), dict) or value.get("name") != expected:
-            return f"the {key} of {node} is {_shown(value)}"
+            return f"the {key} of {node} is {quoted(value)}"
     shape, grid = document.get("shape"), document["chunk_grid"].get("configuration")
     chunk = grid.get("chunk_shape") if isinstance(grid, dict) else grid
     if _is_shape(shape, 0) and _is_shape(chunk, 1) and len(shape) == len(chunk):
         most = math.inf if len(shape) > 1 and _OF_MESHES.fullmatch(node) else _MOST_ELEMENTS.get(len(shape), math.inf)
         if math.prod(shape) <= most and max([*shape, *chunk], default=0) <= _LONGEST_AXIS:
             return ""
-    return f"{node} has the shape {_shown(shape)} in chunks of {_shown(chunk)}"
+    return f"{node} has the shape {quoted(shape)} in chunks of {quoted(chunk)}"
 
 
 def _is_shape(shape: Any, least: int) -> TypeGuard[list[int]]:
     return isinstance(shape, list) and all(type(length) is int and length >= least for length in shape)
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
