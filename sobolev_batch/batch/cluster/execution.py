@@ -292,13 +292,11 @@ class _Loop(Generic[Result]):
 
     def _begin(self) -> bool:
         """Begin the next run; False where none is waiting, or enough have begun."""
-        if len(self._begun) >= self._most_runs:
-            return False
-        for name, stages in self._waiting:
-            self._begun.append(_Run(name, stages))
+        found = None if len(self._begun) >= self._most_runs else next(self._waiting, None)
+        if found is not None:
+            self._begun.append(_Run(*found))
             self._advance(self._begun[-1])
-            return True
-        return False
+        return found is not None
 
     def _submit(self, run: _Run[Result], task: Task) -> None:
         cluster = run.wave.cluster
