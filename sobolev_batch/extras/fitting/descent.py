@@ -44,6 +44,7 @@ class End(Enum):
     INTERRUPTED = "it was interrupted"
 
 
+Notify = Callable[[Reals, float], None]
 # These are statuses of scipy's L-BFGS-B; any other is that of a failed line search.
 _END_OF_STATUS = {0: End.CONVERGED, 1: End.STEPS}
 
@@ -51,37 +52,26 @@ _END_OF_STATUS = {0: End.CONVERGED, 1: End.STEPS}
 class Descent:
     """The descent of a squared distance by L-BFGS, with a small penalty for triangles that lose their shape.
 
-    It goes on from positions (n, 3) in units of length, until the squared distance is below a floor. The unit is the
-    length of a long step, such as that of an edge. After each step, the positions and the objective are notified.
+    It goes on from positions (n, 3) in units of length, until the squared distance is below a floor. After each step,
+    the positions and the objective are notified.
 
     Source: R. Byrd, P. Lu, J. Nocedal, C. Zhu, "A limited memory algorithm for bound constrained optimization"
     (1995), doi:10.1137/0916069; by scipy.
     """
 
     def __init__(
-        self,
-        objective: SquaredDistance,
-        vertices: Reals,
-        smoothing: Smoothing,
-        floor: float,
-        unit: float,
-        notify: Callable[[Reals, float], None],
+        self, objective: SquaredDistance, start: Reals, smoothing: Smoothing, floor: float, notify: Notify
     ) -> None:
-        self.objective, self.smoothing, self.floor, self.unit, self.notify = objective, smoothing, floor, unit, notify
-        self.start = self.vertices = vertices
-        self.first = objective.value(vertices)
-        self.steps = 0
-        self.end: End | None = None
-        self._history = [self.first]
-        self._triangles = objective.transform.triangles
-        self._normals = normals(vertices, self._triangles)
-        self._references = lowest_free_qualities(vertices, self._triangles)
+        self.objective, self.start, self.smoothing, self.floor, self.notify = objective, start, smoothing, floor, notify
+        self._history, self._triangles = [objective.value(start)], objective.transform.triangles
+        self._normals = normals(start, self._triangles)
+        self._references = lowest_free_qualities(start, self._triangles)
+        self._ends: list[End] = []
 
-    def run(self, steps: int) -> None:
-        """Take this many steps at most. One that leaves the lattice's period ends the descent before it."""
-        if self.first <= self.floor:
-            self.end = End.ERROR
-            return
+    def run(self, steps: int) -> End:
+        """Take this many steps at most, none of which leaves the lattice's period, and return why there are no more."""
+        if self._history[0] <= self.floor:
+            return End.ERROR
         try:
             result = minimize(
                 self._scaled,
@@ -92,43 +82,38 @@ class Descent:
                 options={"maxiter": steps, "maxfun": 3 * steps, "maxcor": _MEMORY, "ftol": 0.0, "gtol": 0.0},
             )
         except LatticeError:
-            self.end = End.LEFT
-        else:
-            self.end = self.end or _END_OF_STATUS.get(result.status, End.STUCK)
+            return End.LEFT
+        return self._ends[0] if self._ends else _END_OF_STATUS.get(result.status, End.STUCK)
 
     def _positions(self, parameters: Reals) -> Reals:
-        """Return the vertices for parameters, the steps of free vertices in long steps."""
-        return self.start + self.unit * self.smoothing.movement(parameters.reshape(-1, 3))
+        """Return the vertices for parameters, the steps of free vertices in mean edges."""
+        return self.start + self.smoothing.unit * self.smoothing.movement(parameters.reshape(-1, 3))
 
     def _scaled(self, parameters: Reals) -> tuple[float, Reals]:
         """Return the squared distance relative to the first with the penalty of shapes, and its derivative."""
-        vertices = self._positions(parameters)
+        vertices, first = self._positions(parameters), self._history[0]
         value, gradient = self.objective(vertices)
         penalty, slopes = shape_penalty(vertices, self._triangles, self._references)
-        total = gradient / self.first + _SHAPE_WEIGHT * slopes
-        return value / self.first + _SHAPE_WEIGHT * penalty, (self.unit * self.smoothing.pulled_back(total)).ravel()
+        total = self.smoothing.unit * self.smoothing.pulled_back(gradient / first + _SHAPE_WEIGHT * slopes)
+        return value / first + _SHAPE_WEIGHT * penalty, total.ravel()
 
     def _accept(self, intermediate_result: OptimizeResult) -> None:
-        """Keep a step if it turns no triangle over, and end the descent where nothing more is to be gained."""
-        vertices = self._positions(intermediate_result.x)
-        turned = normals(vertices, self._triangles)
+        """Take a step if it turns no triangle over, and end the descent where nothing more is to be gained."""
+        vertices, before = self._positions(intermediate_result.x), self._normals
+        self._normals = normals(vertices, self._triangles)
         # A triangle that lost its area could go on to any side.
-        had_area = np.any(self._normals != 0, axis=1)
-        if np.any(np.einsum("ij,ij->i", turned, self._normals)[had_area] <= 0):
-            self._stop(End.TURNED)
-        self.vertices, self._normals = vertices, turned
-        value = float(intermediate_result.fun) * self.first
+        if (np.einsum("ij,ij->i", self._normals, before)[np.any(before != 0, axis=1)] <= 0).any():
+            self._ends.append(End.TURNED)
+            raise StopIteration
+        value = float(intermediate_result.fun) * self._history[0]
         self._history.append(value)
-        self.steps += 1
         self.notify(vertices, value)
         if value <= self.floor:
-            self._stop(End.ERROR)
-        if self.steps >= _PATIENCE and value > (1 - _LEAST_PROGRESS) ** 2 * self._history[-_PATIENCE - 1]:
-            self._stop(End.CONVERGED)
-
-    def _stop(self, end: End) -> Any:
-        self.end = end
-        raise StopIteration
+            self._ends.append(End.ERROR)
+        elif len(self._history) > _PATIENCE and value > (1 - _LEAST_PROGRESS) ** 2 * self._history[-_PATIENCE - 1]:
+            self._ends.append(End.CONVERGED)
+        if self._ends:
+            raise StopIteration
 
 
 class Smoothing:
@@ -142,7 +127,8 @@ class Smoothing:
     """
 
     def __init__(self, mesh: Mesh, free: Indices, amount: float) -> None:
-        self.free, self.amount, self._count = free, amount, len(mesh.vertices)
+        self.free, self.amount, self.unit = free, amount, mesh.edge_length_range[0]
+        self._count = len(mesh.vertices)
         ends = Edges.from_mesh(mesh).ends
         neighbours = coo_array((np.ones(len(ends)), ends.T), shape=(self._count, self._count)).tocsr()
         graph: Any = laplacian(neighbours, symmetrized=True)

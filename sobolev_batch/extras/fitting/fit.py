@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 import xarray as xr
@@ -177,18 +175,15 @@ def fit(
     >>> fitted.after.distance < fitted.before.distance / 4
     True
     """
-    (mesh,), (target,) = each(as_mesh, {"mesh": mesh}), each(as_operand, {"target": target})
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    execution = Execution(threads=thread_count(threads))
-    return _measured(mesh, FitProblem.for_target(mesh, target, lattice, settings, execution), (), on_progress)
+    return _measured(FitRun(mesh, target, lattice, settings, None, threads), on_progress)
 
 
 def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, triangles: int | None = None) -> Mesh:
     """Return the mesh that `fit` finds, or `refine` for a number of triangles, without measures of its distance."""
-    goals = () if triangles is None else _goals(len(mesh.triangles), triangles)
-    start = mesh if triangles is None else welded(mesh)[0]
     # The result must not depend on the worker, so one thread it is.
-    run = _finished(FitProblem.for_target(start, target, None, settings, Execution()), goals)
+    run = FitRun(mesh, target, None, settings, triangles, 1)
+    run.finish()
     if run.end is End.INTERRUPTED:
         # A mesh of a study is the whole fit.
         raise KeyboardInterrupt
@@ -196,64 +191,95 @@ def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, triangles: i
 
 
 class FitRun:
-    """A fit that is under way: its positions (n, 3) in units of length, steps taken, and why the last descent ended."""
+    """A fit that is under way: its problem, positions (n, 3) in units of length, steps taken, and why it ended.
 
-    def __init__(self, problem: FitProblem, tell: Callable[[float], None]) -> None:
-        self.problem, self.tell, self.free = problem, tell, problem.free_vertices
-        self.taken, self.end = 0, End.CONVERGED
-        self.vertices = np.asarray(problem.start.vertices)
+    For a number of triangles it goes in rounds, one before each split and one after the last.
+    """
 
-    def finish(self) -> Self:
-        """Carry the fit out, go back to the start if that is nearer, and return the run."""
-        start, order = self.vertices, self.problem.settings.order
+    def __init__(
+        self,
+        mesh: MeshLike,
+        target: OperandLike,
+        lattice: Lattice | None,
+        settings: FitSettings,
+        triangles: int | None,
+        threads: int | None,
+    ) -> None:
+        (self.given,), (operand,) = each(as_mesh, {"mesh": mesh}), each(as_operand, {"target": target})
+        self.goals = [] if triangles is None else _goals(len(self.given.triangles), triangles)
+        start, execution = welded(self.given)[0] if self.goals else self.given, Execution(threads=thread_count(threads))
+        self.problem = FitProblem.for_target(start, operand, lattice, settings, execution)
+        self.vertices, self.taken, self.end = np.asarray(self.problem.start.vertices), 0, End.CONVERGED
+        self.rounds = [*[min(_STEPS_BETWEEN, settings.steps)] * len(self.goals), settings.steps]
+        self.notify: Notify = str
+
+    def finish(self) -> None:
+        """Go through all rounds, or up to an interrupt."""
         try:
-            for shares, smoothing, steps in self._stages():
-                self._descend(shares, smoothing, steps)
+            for goal, steps in zip((None, *self.goals), self.rounds, strict=True):
+                if goal is not None:
+                    self._split(goal)
+                self._fit(steps)
         except KeyboardInterrupt:
             self.end = End.INTERRUPTED
+
+    def _fit(self, steps: int) -> None:
+        """Take this many steps at most, and go back to where they began if that is nearer, also when interrupted."""
+        start, last, order = self.vertices, self.taken + steps, self.problem.settings.order
         try:
+            for shares, smoothing, count in self._stages(steps):
+                self._descend(shares, smoothing, min(count, last - self.taken))
+        finally:
             before, after = (self.problem.squares(vertices, [order])[0] for vertices in (start, self.vertices))
-        except KeyboardInterrupt:
-            self.end = End.INTERRUPTED
-        else:
             if after > before:
-                self.vertices, self.end = start, self.end if self.end is End.INTERRUPTED else End.FARTHER
-        return self
+                self.vertices, self.end = start, End.FARTHER
 
-    def _stages(self) -> list[tuple[OrderWeights, float, int]]:
+    def _stages(self, steps: int) -> list[tuple[OrderWeights, float, int]]:
         """Return shares of orders, smoothing and steps of each stage; a far mesh comes near at a coarse order first."""
         settings = self.problem.settings
-        stages: list[tuple[OrderWeights, float, int]] = []
-        smoothing, left = settings.smoothing, settings.steps
-        if self.problem.relative_distance(settings.coarse_order) > _FAR:
-            part = max(1, int(_FAR_STEPS * settings.steps))
-            stages = [(((settings.coarse_order, 1.0),), amount, part) for amount in _FAR_SMOOTHINGS]
-            smoothing, left = max(smoothing, _FAR_SMOOTHINGS[-1]), left - part * len(stages)
-        return [*stages, (settings.shares, smoothing, max(1, left))]
+        if not self.problem.relative_distance(settings.coarse_order) > _FAR:
+            return [(settings.shares, settings.smoothing, steps)]
+        part = max(1, int(_FAR_STEPS * steps))
+        stages = [(((settings.coarse_order, 1.0),), amount, part) for amount in _FAR_SMOOTHINGS]
+        left = max(1, steps - part * len(stages))
+        return [*stages, (settings.shares, max(settings.smoothing, _FAR_SMOOTHINGS[-1]), left)]
 
     def _descend(self, shares: OrderWeights, amount: float, steps: int) -> None:
         """Go through a stage: descents with ever finer fields, and smoother steps where needed."""
-        problem = self.problem
+        problem, last, retreats = self.problem, self.taken + steps, 0
         weights = problem.relative_to(self.vertices, shares)
-        smoothing = Smoothing(problem.start, self.free, amount)
-        unit, retreats = problem.start.edge_length_range[0], 0
-        left = min(steps, problem.settings.steps - self.taken)
-        while left > 0:
+        smoothing = Smoothing(problem.start, problem.free_vertices, amount)
+        while (before := self.taken) < last:
             objective, floor = problem.objective(self.vertices, weights)
-            descent = Descent(objective, self.vertices, smoothing, floor, unit, self._count)
-            descent.run(left)
-            self.vertices, left, self.end = descent.vertices, left - descent.steps, descent.end or End.CONVERGED
-            if descent.end in (End.TURNED, End.LEFT) and retreats < _MOST_RETREATS:
+            self.end = Descent(objective, self.vertices, smoothing, floor, self._count).run(last - before)
+            if self.end in (End.TURNED, End.LEFT) and retreats < _MOST_RETREATS:
                 retreats += 1
-                smoothing = Smoothing(problem.start, self.free, max(_SMOOTHER * smoothing.amount, 1.0))
+                smoothing = Smoothing(problem.start, smoothing.free, max(_SMOOTHER * smoothing.amount, 1.0))
             # Finer fields may show the way on, unless they are as fine as they can be.
-            elif descent.end is not End.ERROR or not descent.steps:
+            elif self.end is not End.ERROR or self.taken == before:
                 break
 
     def _count(self, vertices: Reals, objective: float) -> None:
-        self.vertices = vertices
-        self.taken += 1
-        self.tell(float(np.sqrt(objective)))
+        self.vertices, self.taken = vertices, self.taken + 1
+        self.notify(FitProgress(self.taken, sum(self.rounds), float(np.sqrt(objective))))
+
+    def _split(self, triangles: int) -> None:
+        """Split the edges of the fitted mesh where that helps most."""
+        mesh, settings = self.problem.given_mesh(self.vertices), self.problem.settings
+        edges = Edges.from_mesh(mesh)
+        finer = edges.split(np.ones(len(edges.ends), dtype=bool))
+        if triangles < 4 * len(mesh.triangles):
+            everywhere = self.problem.remade(finer)
+            vertices = np.asarray(everywhere.start.vertices)
+            weights = everywhere.relative_to(vertices, settings.shares)
+            _, gradient = everywhere.objective(vertices, weights)[0](vertices)
+            at_middles = gradient[everywhere.place][len(mesh.vertices) :]
+            scores = edges.lengths * np.linalg.norm(at_middles, axis=1)
+            if settings.keep_boundary:
+                scores[edges.on_boundary] = 0.0
+            finer = edges.split(best_edges(edges, scores[edges.sides].sum(axis=1), triangles))
+        self.problem = self.problem.remade(finer)
+        self.vertices = np.asarray(self.problem.start.vertices)
 
 
 def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
@@ -276,9 +302,10 @@ def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
     return replace(quality, hausdorff=near["hausdorff"], chamfer=near["chamfer"])
 
 
-def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], on_progress: Notify | None) -> Fit:
+def _measured(run: FitRun, on_progress: Notify | None) -> Fit:
     """Return the mesh of a fit with its distances, or the given one if that is nearer."""
     callback(on_progress)
+    problem = run.problem
     before = measure_quality(problem, problem.start)
     if before.error >= before.distance > 0 and isinstance(problem.target, xr.DataArray):
         raise InputError(
@@ -286,18 +313,18 @@ def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], on_progres
             f"distance {before.distance:.2g} has an error of {before.error:.2g}, so there is nothing that a fit could "
             "lower; take a more negative order, or a field on a larger lattice"
         )
-    with progress_line(on_progress) as notify:
-        run = _finished(problem, goals, notify)
-    problem = run.problem
-    mesh, remarks, end = problem.given_mesh(run.vertices), [], run.end
+    with progress_line(on_progress) as run.notify:
+        run.finish()
+    problem, remarks = run.problem, []
+    found = problem.given_mesh(run.vertices)
     try:
         after = measure_quality(problem, Mesh(run.vertices, problem.start.triangles))
     except KeyboardInterrupt:
-        after, end = FitQuality(np.nan, np.nan), End.INTERRUPTED
+        after, run.end = FitQuality(np.nan, np.nan), End.INTERRUPTED
         remarks.append("it was interrupted before the mesh was measured")
     if after.distance - np.nan_to_num(after.error) > before.distance + np.nan_to_num(before.error):
         remarks.append("no nearer mesh was found: this is the start")
-        mesh, after = given, before
+        found, after = run.given, before
     if after.error >= after.distance > 0:
         remarks.append("the distance is not larger than its error: ask for a more negative order")
     if after.hausdorff > _HAUSDORFF_GROWTH * before.hausdorff:
@@ -305,7 +332,10 @@ def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], on_progres
             f"the Hausdorff distance grew {after.hausdorff / before.hausdorff:.2g} times: the worst point lies "
             "farther away than before; take a larger smoothing or a less negative order"
         )
-    return Fit(mesh, problem.settings.order, before, after, run.taken, end.value, tuple(remarks))
+    count, wanted = len(found.triangles), max(run.goals, default=0)
+    if count < wanted and run.end is not End.INTERRUPTED:
+        remarks.append(f"it has {count:,} triangles instead of {wanted:,}, as splits come in groups")
+    return Fit(found, problem.settings.order, before, after, run.taken, run.end.value, tuple(remarks))
 
 
 def refine(
@@ -356,55 +386,8 @@ def refine(
     >>> len(refined.mesh.triangles) <= 40, refined.after.distance < refined.before.distance / 4
     (True, True)
     """
-    (mesh,), (target,) = each(as_mesh, {"mesh": mesh}), each(as_operand, {"target": target})
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    execution, goals = Execution(threads=thread_count(threads)), _goals(len(mesh.triangles), triangles)
-    problem = FitProblem.for_target(welded(mesh)[0], target, lattice, settings, execution)
-    refined = _measured(mesh, problem, goals, on_progress)
-    count = len(refined.mesh.triangles)
-    if count >= triangles or refined.end == End.INTERRUPTED.value:
-        return refined
-    remark = f"it has {count:,} triangles instead of {triangles:,}, as splits come in groups"
-    return replace(refined, remarks=(*refined.remarks, remark))
-
-
-def _finished(problem: FitProblem, goals: Sequence[int], notify: Notify = str) -> FitRun:
-    """Return the last run, with the steps of all rounds: one before each split and one after the last."""
-    settings, steps = problem.settings, itertools.count(1)
-    between = replace(settings, steps=min(_STEPS_BETWEEN, settings.steps))
-    total = between.steps * len(goals) + settings.steps
-
-    def tell(relative: float) -> None:
-        notify(FitProgress(next(steps), total, relative))
-
-    for goal in (*goals, None):
-        run = FitRun(problem if goal is None else replace(problem, settings=between), tell).finish()
-        if goal is None or run.end is End.INTERRUPTED:
-            break
-        try:
-            problem = problem.remade(_split(problem, problem.given_mesh(run.vertices), goal))
-        except KeyboardInterrupt:
-            run.end = End.INTERRUPTED
-            break
-    run.taken = next(steps) - 1
-    return run
-
-
-def _split(problem: FitProblem, mesh: Mesh, triangles: int) -> Mesh:
-    """Return the fitted mesh of a problem with the edges split where that helps most."""
-    edges = Edges.from_mesh(mesh)
-    everywhere = edges.split(np.ones(len(edges.ends), dtype=bool))
-    if triangles >= 4 * len(mesh.triangles):
-        return everywhere
-    problem = problem.remade(everywhere)
-    vertices = np.asarray(problem.start.vertices)
-    weights = problem.relative_to(vertices, problem.settings.shares)
-    _, gradient = problem.objective(vertices, weights)[0](vertices)
-    at_middles = gradient[problem.place][len(mesh.vertices) :]
-    scores = edges.lengths * np.linalg.norm(at_middles, axis=1)
-    if problem.settings.keep_boundary:
-        scores[edges.on_boundary] = 0.0
-    return edges.split(best_edges(edges, scores[edges.sides].sum(axis=1), triangles))
+    return _measured(FitRun(mesh, target, lattice, settings, triangles, threads), on_progress)
 
 
 def best_edges(edges: Edges, scores: Reals, triangles: int) -> Marks:

@@ -187,11 +187,11 @@ def test_no_triangle_is_turned_over_on_the_way(distance: float) -> None:
 
     objective: Any = Drawn()
     smoothing = Smoothing(sb.Mesh(fan, triangles), np.arange(7), 0.0)
-    found = Descent(objective, fan, smoothing, 0.0, 1.0, lambda vertices, value: None)
-    found.run(20)
-    assert found.end is End.TURNED
-    assert found.vertices[0, 0] < 1
-    a, b, c = (found.vertices[corner] for corner in triangles.T)
+    positions = [fan]
+    descent = Descent(objective, fan, smoothing, 0.0, lambda vertices, value: positions.append(vertices))
+    assert descent.run(20) is End.TURNED
+    assert positions[-1][0, 0] < 1
+    a, b, c = (positions[-1][corner] for corner in triangles.T)
     assert (np.cross(b - a, c - a)[:, 2] > 0).all()
 
 

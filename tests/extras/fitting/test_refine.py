@@ -61,7 +61,7 @@ def test_an_interrupt_keeps_the_best_mesh(monkeypatch: pytest.MonkeyPatch) -> No
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "_split", interrupted)
+    monkeypatch.setattr(module.FitRun, "_split", interrupted)
     found = sb.fitting.refine(start, target, -4.0, triangles=70, steps=5)
     assert found.end == "it was interrupted"
     assert len(found.mesh.triangles) == 20
