@@ -7,14 +7,14 @@ missing arrays; here they are refused. Source: "GIFTI surface data format" 1.0 (
 import base64
 import math
 import zlib
-from collections.abc import Mapping
 from typing import Any, Literal
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.extras.formats.shared import BYTE_ORDERS, typed, xml_events
+from sobolev_batch.extras.formats.shared import BYTE_ORDERS, typed, xml_tree
 from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import Raw, reals, unpacked_limit, whole
 
@@ -33,45 +33,27 @@ _POINTS, _FACES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
 
 def parse_gifti(data: bytes) -> Raw:
     """Return the vertices and triangles of a GIFTI surface."""
-    arrays: dict[str, list[NDArray[Any]]] = {_POINTS: [], _FACES: []}
-    announced, found = None, 0
-    attributes: Mapping[str, str] = {}
-    texts: list[str] | None = None
-    notes: tuple[str, ...] = ()
-    for event, name, values in xml_events(data, "GIFTI"):
-        match event, name:
-            case "start", "GIFTI":
-                announced = values.get("NumberOfDataArrays")
-            case "start", "DataArray":
-                attributes, found = {key: _CALLED.get(value, value) for key, value in values.items()}, found + 1
-            case "start", "MatrixData" if attributes.get("Intent") == _POINTS:
-                texts = []
-            case "end", "MatrixData" if texts is not None:
-                if not np.array_equal(reals("".join(texts).split(), "its transform"), np.eye(4).ravel()):
-                    notes = ("the file has a transform to another frame of coordinates, which is not applied",)
-                texts = None
-            case "start", "Data":
-                # Others hold normals, or values at vertices.
-                texts = [] if attributes.get("Intent") in arrays else None
-            case "text", piece if texts is not None:
-                texts.append(piece)
-            case "end", "Data" if texts is not None:
-                of_kind = arrays[attributes["Intent"]]
-                of_kind.append(_decoded("".join(texts), attributes, found, unpacked_limit(len(data))))
-                texts = None
-                if len(of_kind) > 1:
-                    break
-    else:
-        if announced is not None and whole(announced, "the GIFTI header") != found:
-            raise MeshError(f"the GIFTI header announces {announced[:20]} arrays, found {found}")
-    points, faces = arrays.values()
+    root = xml_tree(data, "GIFTI")
+    arrays = [*root.iter("DataArray")]
+    announced = next((one.get("NumberOfDataArrays") for one in root.iter("GIFTI")), None)
+    if announced is not None and whole(announced, "the GIFTI header") != len(arrays):
+        raise MeshError(f"the GIFTI header announces {announced[:20]} arrays, found {len(arrays)}")
+    # Others hold normals, or values at vertices.
+    points, faces = ([one for one in arrays if one.get("Intent") == intent] for intent in (_POINTS, _FACES))
     if len(points) != 1 or len(faces) != 1:
         raise MeshError(f"a surface has one point set and one triangle array, found {len(points)} and {len(faces)}")
-    return Raw(points[0], faces[0], notes)
+    matrices = [reals((one.text or "").split(), "its transform") for one in points[0].iter("MatrixData")]
+    is_placed = any(not np.array_equal(matrix, np.eye(4).ravel()) for matrix in matrices)
+    note = "the file has a transform to another frame of coordinates, which is not applied"
+    most, numbers = unpacked_limit(len(data)), (1 + arrays.index(one) for one in (*points, *faces))
+    vertices, triangles = (_decoded(arrays[number - 1], number, most) for number in numbers)
+    return Raw(vertices, triangles, (note,) * is_placed)
 
 
-def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: int) -> NDArray[Any]:
+def _decoded(array: Element, number: int, most_bytes: int) -> NDArray[Any]:
     """Return the data of a DataArray, which is the file's array of that number, from 1."""
+    attributes = {key: _CALLED.get(value, value) for key, value in array.items()}
+    text = array.findtext("Data") or ""
     encoding = attributes.get("Encoding", "")
     if attributes.get("ExternalFileName") or "External" in encoding:
         raise MeshError("its data lie in another file; write it with them inside")

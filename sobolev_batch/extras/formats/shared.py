@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
+from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 import numpy as np
@@ -68,6 +69,20 @@ def xml_events(data: bytes, kind: str, most_elements: int = _MOST_ELEMENTS) -> I
         events.clear()
     parser.Parse(b"", True)
     yield from events
+
+
+def xml_tree(data: bytes, kind: str) -> Element:
+    """Parse XML with the limits of `xml_events` into its elements."""
+    builder = TreeBuilder()
+    for event, value, attributes in xml_events(data, kind):
+        match event:
+            case "start":
+                builder.start(value, attributes)
+            case "end":
+                builder.end(value)
+            case _:
+                builder.data(value)
+    return builder.close()
 
 
 def typed(words: Sequence[str], dtype: np.dtype[Any], owner: str) -> NDArray[Any]:

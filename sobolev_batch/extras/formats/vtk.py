@@ -7,17 +7,17 @@ rest of others. Source: Kitware, "VTK File Formats", https://docs.vtk.org/en/lat
 import base64
 import re
 import zlib
-from collections.abc import Mapping
 from functools import partial
 from io import BytesIO
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
-from sobolev_batch.extras.formats.shared import BYTE_ORDERS, SURFACE, beside_volume, typed, xml_events
+from sobolev_batch.extras.formats.shared import BYTE_ORDERS, SURFACE, beside_volume, typed, xml_tree
 from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips, unpacked_limit, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
@@ -44,6 +44,7 @@ _GHOSTS = re.compile(
     rb"(COLOR_SCALARS )?vtkGhostType(?: 1 \d+)?(?: unsigned_char)?(?: 1)?[ \r]*\n(?:LOOKUP_TABLE \w+[ \r]*\n)?"
 )
 # What arrays in XML hold, by their names; old versions of VTK use the second one.
+_SECTIONS = ("Points", "Polys", "Strips", "Cells", "CellData")
 _NAMES = {"celldata vtkghosttype": "ghosts", "celldata vtkghostlevels": "ghosts", "cells types": "types"}
 _APPENDED = re.compile(rb"<AppendedData[^>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](raw|base64)[\"'][^>]{0,200}>\s{0,99}_")
 _END, _END_OF_DATA = b"</VTKFile>", b"</AppendedData>"
@@ -184,51 +185,36 @@ def _of_xml(data: bytes) -> tuple[str, list[_Arrays]]:
     start, end = _APPENDED.search(data), data.rfind(_END_OF_DATA)
     document = data if start is None else data[: start.end()] + _END_OF_DATA + _END
     behind = (data[start.end() : end], start[1] == b"base64") if start and end > 0 else (b"", False)
-    root, counts, attributes = dict[str, str](), dict[str, str](), dict[str, str]()
-    pieces, arrays, texts = list[_Arrays](), _Arrays(), list[str]()
-    section, depth = "", 0
-    for event, name, values in xml_events(document, "VTK"):
-        depth += (event == "start") - (event == "end")
-        match event, name:
-            case "start", "VTKFile":
-                root = values
-            case "start", "Piece":
-                counts, arrays = values, _Arrays()
-                pieces.append(arrays)
-            case "end", "Piece":
-                _require_announced(counts, arrays)
-            case _, ("Points" | "Polys" | "Strips" | "Cells" | "CellData"):
-                section = name.lower() if event == "start" else ""
-            case "start", "DataArray":
-                # Only its own text holds its values, and not that of elements within it.
-                attributes, texts, depth = values, [], 0
-            case "text", piece if depth == 0:
-                texts.append(piece)
-            case "end", "DataArray" if section:
-                key = section if section == "points" else f"{section} {attributes.get('Name', '').lower()}"
+    root, pieces = xml_tree(document, "VTK"), list[_Arrays]()
+    for piece in root.iter("Piece"):
+        pieces.append(arrays := _Arrays())
+        for section in piece:
+            for one in section.iter("DataArray") if section.tag in _SECTIONS else ():
+                key = "points" if section.tag == "Points" else f"{section.tag} {one.get('Name', '')}".lower()
                 key = _NAMES.get(key, key)
                 if key in arrays:
                     raise MeshError(f"a piece repeats the array {key[:40]!r}")
                 if not key.startswith("celldata"):
-                    arrays[key] = _decoded(attributes, "".join(texts), behind, root, unpacked_limit(len(data)))
+                    arrays[key] = _decoded(one, behind, root, unpacked_limit(len(data)))
+        _require_announced(piece, arrays)
     return root.get("type", "nothing"), pieces
 
 
-def _require_announced(counts: Mapping[str, str], arrays: _Arrays) -> None:
+def _require_announced(piece: Element, arrays: _Arrays) -> None:
     """Refuse a piece whose arrays have other numbers of entries than it announces."""
     lengths = {name: len(arrays.get(f"{name} offsets", _NONE)) for name in _FACES}
     for name, length in {**lengths, "points": len(arrays.get("points", _NONE)) / 3}.items():
-        announced = whole(counts.get(f"NumberOf{name.capitalize()}", "0"), "a piece")
+        announced = whole(piece.get(f"NumberOf{name.capitalize()}", "0"), "a piece")
         if announced != length:
             raise MeshError(f"a piece announces {announced} {name}, and has {length:g}")
 
 
-def _decoded(
-    attributes: Mapping[str, str], text: str, behind: tuple[bytes, bool], root: Mapping[str, str], most: int
-) -> NDArray[Any]:
+def _decoded(array: Element, behind: tuple[bytes, bool], root: Element, most: int) -> NDArray[Any]:
     """Return the values of a DataArray, from its text or from what lies behind the XML, as at most so many bytes."""
-    kind, form = attributes.get("type", ""), attributes.get("format", "ascii")
-    owner = f"its array {attributes.get('Name')!r}"
+    kind, form = array.get("type", ""), array.get("format", "ascii")
+    owner = f"its array {array.get('Name')!r}"
+    # Elements within it have texts of their own.
+    text = "".join([array.text or "", *(inner.tail or "" for inner in array)])
     if kind.lower() not in _TYPES or form not in ("ascii", "binary", "appended"):
         raise MeshError(f"{owner} has the type {kind[:40]!r} and the format {form[:40]!r}, which VTK does not have")
     order, head_kind = root.get("byte_order", "LittleEndian"), root.get("header_type", "UInt32").lower()
@@ -239,7 +225,7 @@ def _decoded(
         return typed(text.split(), dtype, owner)
     head = np.dtype(_TYPES[head_kind]).newbyteorder(BYTE_ORDERS[order])
     source, is_base64 = behind if form == "appended" else ("".join(text.split()).encode(), True)
-    place = whole(attributes.get("offset", ""), owner) if form == "appended" else 0
+    place = whole(array.get("offset", ""), owner) if form == "appended" else 0
 
     def fetch(place: int, count: int) -> tuple[bytes, int]:
         """Return so many bytes from a place on, and the place behind them."""
