@@ -192,12 +192,9 @@ class Smooth(ABC):
     def bounding_sphere(self) -> tuple[Point, float]:
         """Centre of the bounding box, and radius of the smallest sphere around it that holds the surface."""
         lower, upper = self.extent.box
-        x, y, z = (lower + (upper - lower) / 2).tolist()
-
-        def distances(points: Reals) -> Reals:
-            return np.asarray(np.sqrt((points[0] - x) ** 2 + (points[1] - y) ** 2 + (points[2] - z) ** 2))
-
-        return (x, y, z), float(self._greatest(distances, 1)[0])
+        center = (lower + (upper - lower) / 2).reshape(3, 1, 1, 1)
+        x, y, z = center.ravel().tolist()
+        return (x, y, z), float(self._greatest(lambda points: np.linalg.norm(points - center, axis=0), 1)[0])
 
     def _greatest(self, heights: Callable[[Reals], Reals], count: int) -> Reals:
         """Return the maxima over the surface (count,) of as many functions of position."""
@@ -287,14 +284,11 @@ class ParametrisedSurface(Smooth):
 
     def _check_closed(self) -> None:
         size = float(np.ptp(self.extent.box, axis=0).max())
-        along_u, along_v = (np.linspace(interval.low, interval.high, _CHECKS) for interval in self.intervals)
-        for name, interval, other in (("u", self.u, along_v), ("v", self.v, along_u)):
-            if not interval.periodic:
-                continue
-            ends = [np.full(_CHECKS, end) for end in (interval.low, interval.high)]
-            first, last = (self.positions(end, other) if name == "u" else self.positions(other, end) for end in ends)
-            gap = float(np.abs(first - last).max())
-            if not gap <= _CLOSED * size:
+        lines = [np.linspace(interval.low, interval.high, _CHECKS) for interval in self.intervals]
+        grid = self.positions(*np.meshgrid(*lines, indexing="ij"))
+        for axis, (name, interval) in enumerate({"u": self.u, "v": self.v}.items(), 1):
+            gap = float(np.abs(grid.take(0, axis) - grid.take(-1, axis)).max())
+            if interval.periodic and not gap <= _CLOSED * size:
                 raise InputError(
                     f"the surface is said to be periodic in {name}, but its positions at the ends {interval.low:g} and "
                     f"{interval.high:g} are up to {gap / self.scale:.3g} apart"

@@ -6,7 +6,7 @@ import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.arrays import Indices, Reals, slices
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.parsing import Raw
 from sobolev_batch.geometry.mesh import cross, cross_lengths, dot
@@ -59,22 +59,18 @@ def cut_polygons(vertices: NDArray[Any], corners: Indices, sizes: Indices) -> Ra
     if (sizes == 4).all():
         return Raw(vertices, _cut_quads(axes, corners.reshape(-1, 4), found), _notes(found, size, len(sizes)))
     starts, parts, owners = np.cumsum(sizes) - sizes, [], []
+    for number in (3, 4):
+        faces = np.flatnonzero(sizes == number)
+        of_faces = corners[starts[faces, None] + np.arange(number)]
+        parts.append(of_faces if number == 3 else _cut_quads(axes, of_faces, found))
+        owners.append(faces.repeat(number - 2))
     others = np.flatnonzero(sizes > 4)
-    batches = np.split(others, range(_BATCH, len(others), _BATCH))
-    for faces in (np.flatnonzero(sizes == 3), np.flatnonzero(sizes == 4), *batches):
-        if not faces.size:
-            continue
-        number = sizes[faces[0]]
-        if number > 4:
-            near = slice(faces[0], faces[-1] + 1)
-            of_near = corners[starts[faces[0]] : starts[faces[-1]] + sizes[faces[-1]]]
-            is_of_others = np.repeat(sizes[near] > 4, sizes[near])
-            triangles, own = _cut_others(axes, of_near[is_of_others], sizes[faces], found)
-        else:
-            triangles, own = corners[starts[faces, None] + np.arange(number)], np.arange(len(faces)).repeat(number - 2)
-            triangles = triangles if number == 3 else _cut_quads(axes, triangles, found)
+    for faces in (others[batch] for batch in slices(len(others), _BATCH)):
+        own = sizes[faces]
+        places = np.repeat(starts[faces] - np.cumsum(own) + own, own) + np.arange(own.sum())
+        triangles, polygon = _cut_others(axes, corners[places], own, found)
         parts.append(triangles)
-        owners.append(faces[own])
+        owners.append(faces[polygon])
     order = np.argsort(np.concatenate(owners), kind="stable")
     return Raw(vertices, np.concatenate(parts)[order], _notes(found, size, len(sizes)))
 
@@ -103,15 +99,14 @@ def _notes(found: _Measures, size: float, faces: int) -> tuple[str, ...]:
 def _cut_quads(axes: list[Reals], quads: Indices, found: _Measures) -> Indices:
     """Return the triangles (2 k, 3) of quadrilaterals (k, 4)."""
     cut = quads.take([0, 1, 2, 0, 2, 3], axis=1)
-    for start in range(0, len(quads), _BATCH):
-        batch = quads[start : start + _BATCH]
-        edges = _edges(axes, batch)
+    for part in slices(len(quads), _BATCH):
+        edges = _edges(axes, quads[part])
         first, second = cross(edges[0], edges[1]), cross(edges[1], edges[2])
         product = dot(first, second)
         is_flat = product * np.abs(product) > (1 - 2 * _EQUAL_COSINES) * dot(first, first) * dot(second, second)
-        rest = np.flatnonzero(~is_flat)
+        rest = part.start + np.flatnonzero(~is_flat)
         if rest.size:
-            turned = start + rest[_is_turned(axes, batch[rest], found)]
+            turned = rest[_is_turned(axes, quads[rest], found)]
             cut[turned] = quads[turned].take([1, 2, 3, 1, 3, 0], axis=1)
     return cut.reshape(-1, 3)
 
