@@ -32,6 +32,9 @@ _EQUAL = 1e-9
 # Remeshers fail at single sizes, and at all that are too coarse. So a size that fails between two that do not says
 # nothing, and where only the coarsest one failed, another is tried, so many widths of the last bracket beyond it.
 _BEYOND = 1.5
+# So many trials that all made the same mesh, or none, are followed by the finest size, or by the one beside it where
+# that holds: others between would fail too. Until a mesh was made, either end may be the finest.
+_ALIKE = 3
 # Trials at once lie the last bracket's width apart, or this part of the way to the prediction; first, this logarithm.
 _APART, _SPREAD, _FIRST_APART = 0.9, 0.4, 0.7
 
@@ -143,6 +146,13 @@ class Search:
         again = self._again(trials, bracket, sign) if len(trials) < _MOST_TRIALS else ()
         if len(trials) >= _MOST_TRIALS or not self._is_open(bracket, start, end):
             return again
+        tried, failed = {one.size for one in trials}, [one for one in trials if not one.is_within]
+        if start == finest and len(failed) >= _ALIKE and len({(one.triangles, one.estimate) for one in failed}) == 1:
+            if bracket.best is not None:
+                return (self._size(sign, finest + _BESIDE * math.log1p(self.precision), bracket),)
+            ends = (float(self.high), float(self.low))[::sign]
+            is_open = self.larger_is_coarser is None and not failed[0].triangles
+            return tuple(size for size in ends[not is_open :] if size not in tried)[:1]
         points = {
             sign * math.log(one.size): math.log(max(one.estimate / self.limit, math.exp(_LEAST_EXCESS)))
             for one in trials
@@ -153,7 +163,6 @@ class Search:
         places = self._places(points, len(trials), bracket, start, end, wanted)
         if self.first is not None and not trials:
             places = [sign * math.log(self.first) + _FIRST_APART * (k - (count - 1) / 2) for k in range(count)]
-        tried = {one.size for one in trials}
         sizes = dict.fromkeys([*again, *(self._size(sign, place, bracket) for place in places)])
         return tuple(size for size in sizes if size not in tried)[:count]
 

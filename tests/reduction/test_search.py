@@ -199,6 +199,49 @@ def test_sizes_that_cannot_be_made_do_not_hold_up_the_search(seed: int) -> None:
         assert found.best.size <= max(1.0501 * found.failed.size, found.failed.size + 1)
 
 
+@pytest.mark.parametrize("larger_is_coarser", [True, False, None])
+@pytest.mark.parametrize("value", [math.nan, 7.0])
+def test_what_fails_alike_at_all_sizes_ends_the_search_soon(value: float, larger_is_coarser: bool | None) -> None:
+    search = Search(1.0, 1, 10**7, larger_is_coarser=larger_is_coarser)
+    trials: list[Trial] = []
+    while sizes := search.next(trials):
+        made = math.inf if value != value else value
+        trials += [Trial(size, 80 * (value == value), made, made, made) for size in sizes]
+    # Of meshes of equal size, none is the finest.
+    finest = {True: {1.0}, False: {1e7}, None: {1.0, 1e7} if value != value else {1.0}}[larger_is_coarser]
+    assert finest <= {one.size for one in trials}
+    assert len(trials) <= 5
+
+
+@pytest.mark.parametrize("is_all", [True, False])
+def test_the_finest_size_is_the_mesh_itself_and_the_next_one_is_tried(is_all: bool) -> None:
+    # A remesher that makes nothing, or nothing of less than a third of the triangles.
+    def distance(size: float) -> float:
+        return 0.0 if size == 10**6 else math.nan if is_all or size < 3e5 else 1e5 / size
+
+    search = Search(1.0, 4, 10**6, is_whole=True, larger_is_coarser=False, first=1000)
+    trials = trials_of(search, distance)
+    found = search.bracket(trials)
+    assert found.best is not None
+    assert found.failed is not None
+    assert found.best.size <= 1.0501 * found.failed.size
+    assert found.best.size == 10**6 if is_all else found.best.size < 3.2e5
+    assert len(trials) <= (5 if is_all else 14)
+
+
+@pytest.mark.parametrize("power", [1, -1])
+def test_sizes_at_either_end_are_found_where_all_others_fail(power: int) -> None:
+    # It is not known which end is coarse, and only a hundredth of the range can be made.
+    search = Search(1.0, 0.001, 1.0)
+    trials: list[Trial] = []
+    while sizes := search.next(trials):
+        for size in sizes:
+            length = size if power > 0 else 0.001 / size
+            made = (math.ceil(1 / length), *(100 * length,) * 3, True) if length < 0.01 else ()
+            trials.append(Trial(size, *made))
+    assert search.bracket(trials).best is not None
+
+
 def test_a_closer_bracket_goes_on_from_the_same_trials() -> None:
     wide = Search(1.0, 4, 10_000, is_whole=True, larger_is_coarser=False)
     trials = trials_of(wide, lambda n: 500 / n)
