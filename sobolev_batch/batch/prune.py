@@ -1,21 +1,27 @@
 """Pruning: what a store keeps and no record needs, counted and removed."""
 
+import logging
 import re
 from contextlib import nullcontext
+from itertools import filterfalse
 
 from sobolev_batch.store.encoding import ROOT
-from sobolev_batch.store.layout import FIELD, OCTAVES, QUALITY, TAGS, Store
+from sobolev_batch.store.layout import FIELD, GROUPS_OF_TASKS, OCTAVES, QUALITY, TABLES, TAGS, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
 from sobolev_batch.store.objects import Objects, lost_objects, root_of
 from sobolev_batch.store.workspace import Contents
+
+_log = logging.getLogger(__name__)
 
 _LOST, _KILLED, _UNLISTED = (
     "fields of meshes that are no longer in the study",
     "leftovers of runs that were killed, and earlier fields of meshes that fail now",
     "tables that the store does not list",
 )
-# Other programs may leave files of their own beside those of rows.
+# Other programs and people may leave files of their own beside those of rows, and at the root beside these.
+_GROUPS = {*TABLES, *GROUPS_OF_TASKS}
+_AT_ROOT = {*_GROUPS, ROOT, TAGS, *LOCK_KEYS}
 _OF_ROW = re.compile(rf"((?:{FIELD}|{OCTAVES})/c/([0-9]+))/")
 
 
@@ -26,7 +32,11 @@ def prune_lost_objects(location: Location, *, is_dry: bool = True) -> int:
         return 0
     with nullcontext() if is_dry else locked(location, Lock.of_this_process()):
         for name in lost_objects(location, objects.name, objects.names):
-            total += sum(location.below(name).sizes("").values())
+            place = location.below(name)
+            if foreign := sorted(filterfalse(PARTIAL_FILE.search, place.names() - _AT_ROOT)):
+                _log.warning("%s: no longer in the study, but kept: %s in it is not the store's", place, foreign[0])
+                continue
+            total += sum(place.sizes("").values())
             if not is_dry:
                 location.remove(name)
     return total
@@ -43,7 +53,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
         store = Store.open(location)
         contents = Contents.of_store(store)
         lost, kept = set(range(len(contents.labels))) - contents.rows.keys(), contents.complete.keys()
-        listed = {name.split("/")[0] for name in store.documents} | {ROOT, TAGS, *LOCK_KEYS}
+        unlisted = _GROUPS - {name.split("/")[0] for name in store.documents}
         counts, prefixes = dict.fromkeys((_LOST, _KILLED, _UNLISTED), 0), set[str]()
         for key, size in location.sizes("").items():
             if PARTIAL_FILE.search(key):
@@ -52,7 +62,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
                 if (row := int(place[2])) not in kept:
                     counts[_LOST if row in lost else _KILLED] += size
                     prefixes.add(place[1])
-            elif (group := key.split("/")[0]) not in listed:
+            elif (group := key.split("/")[0]) in unlisted:
                 counts[_UNLISTED] += size
                 prefixes.add(group)
         if not is_dry:

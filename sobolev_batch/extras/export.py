@@ -7,6 +7,7 @@ import dask
 import xarray as xr
 
 from sobolev_batch.errors import from_extra, write_file
+from sobolev_batch.store.layout import TABLES
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, stores_of
@@ -15,7 +16,6 @@ from sobolev_batch.transform.lattice import Orders
 
 ExportFormat = Literal["parquet", "netcdf", "csv"]
 BY_ENDING: dict[str, ExportFormat] = {".parquet": "parquet", ".nc": "netcdf", ".csv": "csv"}
-_GROUPS = ("meshes", "norms", "distances", "convergence", "proximity")
 
 
 def export(store: AnyStore, path: Path, style: ExportFormat, order: Orders | None = None) -> None:
@@ -48,7 +48,7 @@ def _groups_of(store: AnyStore) -> xr.DataTree:
         # Without tables it says so.
         finished_group(tree, "meshes", load=False)
         groups[name or "/"] = xr.Dataset(attrs=tree.attrs)
-        for group in [one for one in _GROUPS if one in tree.children]:
+        for group in [one for one in TABLES if one in tree.children]:
             groups[f"{name}/{group}".lstrip("/")] = _as_netcdf(tree[group].to_dataset().load())
     groups["/"].attrs |= {"Conventions": "CF-1.11", "history": f"{utc_now()} sobolev-batch export"}
     return xr.DataTree.from_dict(groups)

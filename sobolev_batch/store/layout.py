@@ -72,7 +72,8 @@ DESCRIPTION = (
     "Begin with the group convergence: distances of meshes to their reference. To read all groups: "
     'xarray.open_datatree(store, engine="zarr"), or sobolev_batch.open_store(store)'
 )
-# Tables whose rows the root of several objects repeats.
+# Groups of tables, and those whose rows the root of several objects repeats.
+TABLES = ("meshes", "norms", "distances", "convergence", "proximity")
 TABLES_OF_ALL = ("meshes", "convergence", "proximity")
 # These arrays have chunks for rows, which need not be computed.
 _OF_ROWS = frozenset({FIELD, OCTAVES, RECORD, PAGE})

@@ -469,9 +469,13 @@ def test_objects_come_and_go(changeable: Path, threads: Client) -> None:
     (changeable / "notes").mkdir()
     zarr.create_group(changeable / "foreign")
     shutil.copytree(changeable / "b", changeable / "copy of b")
-    done = call("prune", changeable, "--yes")
-    assert done.stdout.startswith("objects that are no longer in the study: ")
-    assert not {"a", "d"} & {path.name for path in changeable.iterdir()}
+    for theirs in "a", "":
+        # What somebody keeps in the store of an object is not removed with it.
+        (changeable / "d" / "notes.txt").touch() if theirs else (changeable / "d" / "notes.txt").unlink()
+        done = call("prune", changeable, "--yes")
+        assert done.stdout.startswith("objects that are no longer in the study: ")
+        assert ("notes.txt in it is not the store's" in done.stderr) == bool(theirs)
+        assert {"a", "d"} & {path.name for path in changeable.iterdir()} == ({"d"} if theirs else set())
     assert all((changeable / name).is_dir() for name in ("notes", "foreign", "copy of b"))
     assert sb.verify(changeable).is_sound
     with pytest.raises(sb.errors.StoreError, match="the store of several objects; name that of one"):

@@ -385,8 +385,13 @@ def test_what_no_record_needs_is_counted_and_then_removed(copy: Path, threads: C
     (chunks / "99").mkdir()
     (chunks / "99" / "0").write_bytes(b"12345")
     (copy / "meshes" / f"x.{'0' * 32}.partial").write_bytes(b"123")
-    (copy / "earlier").mkdir()
-    (copy / "earlier" / "zarr.json").write_bytes(b"1")
+    (copy / "proximity").mkdir()
+    (copy / "proximity" / "zarr.json").write_bytes(b"1")
+    # What somebody else keeps in the folder stays.
+    (copy / "notes").mkdir()
+    theirs = copy / "notes" / "zarr.json", copy / "notes.txt"
+    for path in theirs:
+        path.touch()
     before = contents(copy)
     counted = call("prune", copy)
     assert list(prune(Location.parse(copy)).values()) == [lost, 8, 1]
@@ -395,7 +400,8 @@ def test_what_no_record_needs_is_counted_and_then_removed(copy: Path, threads: C
     assert "removed" in call("prune", copy, "--yes").stdout
     left = contents(copy)
     assert {path for path in sound if path not in left} == {path for path in sound if chunks / str(row) in path.parents}
-    assert left.keys() <= sound.keys() | {copy / f"records/record/c/{row}", chunks / ".nfs1"}
+    assert left.keys() <= sound.keys() | {copy / f"records/record/c/{row}", chunks / ".nfs1", *theirs}
+    assert left.keys() >= {*theirs}
     assert call("prune", copy).stdout == "nothing to remove\n"
     found = verify(copy)
     assert (found.is_sound, found.complete, found.total) == (True, 4, 4)
