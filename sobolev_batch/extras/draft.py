@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import chain, product, takewhile
+from itertools import chain, product, starmap, takewhile
 from pathlib import Path, PurePosixPath
 from string import Template
 
@@ -144,7 +144,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
         alone = () if families else _originals(references, sizes, below)
-        sections, summary = alone or _several_objects(references, families, below)
+        sections, summary = alone or _several_objects(references, families, below, base)
     lacks = "no other mesh belongs to it by name, nor it to one"
     left_out |= {str(path): lacks for path in sizes if path not in used}
     name = _json(_free_name(folder.resolve().name, fallback="study"))
@@ -377,18 +377,44 @@ def _originals(
 
 
 def _several_objects(
-    references: Mapping[str, PurePosixPath], families: _Families, folder: PurePosixPath
+    references: Mapping[str, PurePosixPath], families: _Families, folder: PurePosixPath, base: Path
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Return the section of a study of several objects, which lists their meshes, and what it holds."""
-    listed = [(name, REFERENCE_LABEL, path) for name, path in references.items()]
-    listed += [(name, method, path) for (name, method), paths in families.items() for path in paths]
-    meshes = "".join(
-        _filled("mesh", name=_json(name), method=_json(method), path=_json(str(folder / path)))
-        for name, method, path in listed
-    )
-    counts = Counter(method for _, method, _ in listed[len(references) :])
+    """Return the sections of a study of several objects, by patterns or as a list of meshes, and what they hold."""
+    listed = [(name, REFERENCE_LABEL, str(folder / path)) for name, path in references.items()]
+    listed += [(name, method, str(folder / path)) for (name, method), paths in families.items() for path in paths]
+    of_meshes = listed[len(references) :]
+    counts = Counter(method for _, method, _ in of_meshes)
     methods = (f"method {method}: {_count(count)}" for method, count in counts.items())
-    return [_filled("objects", meshes=meshes)], (_objects_text(references), *methods)
+    path, *others = {path.replace(name, OBJECT) for name, _, path in listed[: len(references)]}
+    patterns = "".join(f"    {_json(one)},\n" for one in dict.fromkeys(starmap(_pattern, of_meshes)))
+    remark = "new files of these kinds count too"
+    sections = [
+        _filled("reference", remark=remark, path=_json(path)),
+        _filled("family", name=_json(METHOD), paths=patterns, size=_count(len(of_meshes))),
+    ]
+    if others or not _names_these(sections, listed, base):
+        values = (dict(zip(("name", "method", "path"), map(_json, one), strict=True)) for one in listed)
+        sections = [_filled("objects", meshes="".join(_filled("mesh", **each) for each in values))]
+    return sections, (_objects_text(references), *methods)
+
+
+def _pattern(name: str, method: str, path: str) -> str:
+    """Return the path of a mesh with placeholders for its object and its method, and stars for numbers."""
+    for text, placeholder in ((re.escape(name), OBJECT), (re.escape(method), METHOD), (_NUMBER, "*")):
+        path = re.sub(rf"(?<![^\W_]){text}(?![^\W_])", placeholder, path)
+    return path
+
+
+def _names_these(sections: Sequence[str], listed: Iterable[tuple[str, str, str]], base: Path) -> bool:
+    """Return whether sections of a study name these meshes of objects and methods, and no others."""
+    with suppress(StudyError, MeshError):
+        text = _filled("study", name=_json("patterns"), sections="\n".join(sections))
+        study = Study.from_table(tomllib.loads(text), folder=base)
+        sources = {(name, family.name): family.source for name, one in study.objects.items() for family in one.families}
+        sources |= {(name, REFERENCE_LABEL): one.reference for name, one in study.objects.items()}
+        found = ((*key, member.path) for key, source in sources.items() for member in source.members(base))
+        return sorted(found) == sorted((name, method, (base / path).absolute()) for name, method, path in listed)
+    return False
 
 
 def _objects_text(names: Iterable[str]) -> str:

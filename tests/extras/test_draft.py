@@ -133,6 +133,9 @@ def test_several_objects(tmp_path: Path, layout: str) -> None:
         path: (one.lower(), family.strip("*?")) for (one, family), paths in families.items() for path in paths.values()
     }
     assert (found, summary[0].lower()) == (own, "2 objects: big cow, cow")
+    # A list names each mesh, where names follow no pattern.
+    is_listed = "[objects]" in (tmp_path / "study.toml").read_text("utf-8")
+    assert is_listed == (layout in ("methods first", "sizes first", "beside others", "hostile"))
 
 
 @pytest.mark.parametrize(("level", "is_paired"), [(2, False), (3, True)])
