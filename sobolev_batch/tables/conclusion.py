@@ -10,9 +10,10 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from sobolev_batch.geometry.proximity import METRICS
 from sobolev_batch.shown import few_of
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import ALONE, joined, notes_of_left_out, remarks, tables_of
+from sobolev_batch.tables.convergence import ALONE, DEVIATION, joined, notes_of_left_out, remarks, tables_of
 from sobolev_batch.tables.open import AnyStore, as_tree, source_of, stores_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.smallest import remark, smallest_of
@@ -39,15 +40,18 @@ VERDICT_COLUMNS = (
     Column("mesh", "mesh", kind="text"),
     Column("relative", "relative", percent, "relative_error"),
     Column("triangles", "triangles", count),
+    DEVIATION,
     Column("remark", "remark", kind="text"),
 )
 _TOTALS = ("meshes", "missing", "above_rtol")
+_OF_NEAREST = ["mesh", "relative", "relative_error", *METRICS["hausdorff"]]
 # What an object is judged by: to cut it from all columns of `table` takes much longer.
-_OF_OBJECTS = ["order", "mesh", "distance", "relative", "relative_error", "resolved", "within"]
+_OF_OBJECTS = ["order", "distance", "resolved", "within", *_OF_NEAREST]
 _OBJECT_COLUMNS = (
     Column("object", "object", kind="label"),
     Column("mesh", "nearest mesh", kind="text"),
     Column("relative", "relative", percent, "relative_error"),
+    DEVIATION,
     *(Column(name, name.replace("_", " "), count) for name in _TOTALS),
 )
 
@@ -65,13 +69,14 @@ def study_verdict(
     sizes = _sizes(frame.drop_duplicates("mesh"))
     shown_sizes = spread(sizes, _MOST_SIZES)
     sized = frame[frame["triangles"] > 0]["family"].unique().tolist()
+    deviations = frame.drop_duplicates("mesh").set_index("mesh").filter(METRICS["hausdorff"]).to_dict(orient="index")
     families, sentences, lines = sized[:_MOST_FAMILIES], [], list[TableRow]()
     for order, rows in frame.groupby("order", sort=False):
         at_sizes, at_shown = ([rows[rows["mesh"].isin(labels)] for labels in some] for some in (sizes, shown_sizes))
         at_order = f"at order {order_text(order)}"
-        sentences.append(f"{_of_sizes(at_order, at_sizes)}{_sentence(at_order, rows, frame.attrs['reference'])}")
+        sentences.append(f"{_of_sizes(at_order, at_sizes)}{_sentence(at_order, rows, frame.attrs)}")
         of_order = (*_nearest_rows(rows, at_shown), *_smallest_rows(rows, families), *_doubtful_rows(rows, failed))
-        lines += [{**line, "order": order} for line in of_order]
+        lines += [{**line, **deviations.get(line.get("mesh"), {}), "order": order} for line in of_order]
     shown = {"sizes": (len(shown_sizes), len(sizes)), "families": (len(families), len(sized))}
     omitted = [f"{few} of {total} {things}" for things, (few, total) in shown.items() if few < total]
     return tuple(sentences), lines, " and ".join(omitted)
@@ -104,8 +109,8 @@ def _of_sizes(at_order: str, at_sizes: Sequence[pd.DataFrame]) -> str:
     return f"{', '.join(parts)}, {at_order}. "
 
 
-def _sentence(at_order: str, rows: pd.DataFrame, reference: str) -> str:
-    name = "the reference" if reference == "reference" else reference
+def _sentence(at_order: str, rows: pd.DataFrame, known: Mapping[Any, Any]) -> str:
+    name = "the reference" if known["reference"] == "reference" else known["reference"]
     closest, compared = _nearest(rows), int(rows["distance"].notna().sum())
     if compared == 0:
         return f"No mesh could be compared with {name}."
@@ -116,9 +121,12 @@ def _sentence(at_order: str, rows: pd.DataFrame, reference: str) -> str:
     amount = percent(best["relative"], best["relative_error"]).replace(" ", "\N{NO-BREAK SPACE}")
     who = rivals[0] if len(rivals) == 1 else f"one of {few_of(rivals)}"
     doubt = f", and the errors leave open whether {who} is nearer" if rivals else ""
+    worst = DEVIATION.text(best)
+    deviation = f" The largest deviation of {best['mesh']} is {worst} {known['unit']}." if worst else ""
     if compared == 1:
-        return f"{best['mesh']} differs from {name} by {amount} {at_order}."
-    return f"Of {compared:,} meshes, {best['mesh']} is nearest to {name} {at_order}: it differs by {amount}{doubt}."
+        return f"{best['mesh']} differs from {name} by {amount} {at_order}.{deviation}"
+    nearest = f"Of {compared:,} meshes, {best['mesh']} is nearest to {name} {at_order}"
+    return f"{nearest}: it differs by {amount}{doubt}.{deviation}"
 
 
 def _sizes(rows: pd.DataFrame) -> list[list[str]]:
@@ -228,7 +236,7 @@ def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[flo
         reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
         # Orders are written as in captions of tables and in options.
         sentences, rows, omitted = study_verdict(frame, reasons.to_dict(), "{:g}".format)
-        names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
+        names = ("order", "verdict", *frame.filter(_OF_NEAREST), "triangles", "remark", "absent")
         for_programs[name] = pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"})
         full = [{"remark": row.get("absent"), **row, "absent": ""} for row in rows]
         sections += [Section(f"Object {name}")] if name else []
@@ -252,23 +260,23 @@ def format_objects(
     Those are first that lack most meshes, and then those whose nearest mesh is farthest from its reference.
     """
     frames = tables_of(store, orders)
-    rows = pd.concat({name: frame[_OF_OBJECTS] for name, frame in frames.items()}, names=["object"])
+    rows = pd.concat({name: frame.filter(_OF_OBJECTS) for name, frame in frames.items()}, names=["object"])
     rows = rows.reset_index("object").reset_index(drop=True)
     keys = ["order", "object"]
     totals = rows[keys].join(counted(rows)).groupby(keys, sort=False).sum()
     known = rows[rows["relative"].notna()]
-    nearest = known.loc[known.groupby(keys)["relative"].idxmin()].set_index(keys)
-    frame = totals.join(nearest[["mesh", "relative", "relative_error"]]).fillna({"mesh": ""}).reset_index()
-    frame = frame[[*keys, "mesh", "relative", "relative_error", *_TOTALS]]
+    nearest = known.loc[known.groupby(keys)["relative"].idxmin()].set_index(keys).filter(_OF_NEAREST)
+    frame = totals.join(nearest).fillna({"mesh": ""}).reset_index()[[*keys, *nearest, *_TOTALS]]
     frame = frame.sort_values(["missing", "relative"], ascending=False, kind="stable")
     sections, more = [] if len(frame) else [Section(sentences=[ALONE])], list[str]()
     place = str(source_of(store) or "STORE" if isinstance(store, xr.DataTree) else store)
     worst = [shlex.quote(f"{place}/{name}") for name in frame["object"][:1] if name]
     one = [f"more on an object: sobolev-batch table verdict {name}" for name in worst]
+    unit = f"; deviations are in {next(iter(frames.values())).attrs['unit']}" if DEVIATION.name in frame else ""
     for order, of_order in frame.groupby("order", sort=False):
         shown = of_order.to_dict(orient="records")[:most]
         columns = [one for one in _OBJECT_COLUMNS if one.format is not count or any(row[one.name] for row in shown)]
-        sections.append(Section(f"Objects at order {order:g}, the worst first", [(columns, shown)]))
+        sections.append(Section(f"Objects at order {order:g}, the worst first{unit}", [(columns, shown)]))
         if len(shown) < len(of_order):
             more = [f"{len(of_order) - len(shown):,} more: sobolev-batch table objects {shlex.quote(place)}"]
     return rendered(style, frame, sections, [*more, *one, *notes_of_left_out(store, frames)])

@@ -81,6 +81,7 @@ _COLUMNS = (
     Column("area_fraction", "area", lambda fraction: f"{100 * fraction:.0f} %"),
     Column("distance", "distance", with_error, "error"),
 )
+DEVIATION = Column("hausdorff", "largest deviation", between, "hausdorff_upper")
 _METRIC_COLUMNS = (
     Column("hausdorff", "Hausdorff", between, "hausdorff_upper"),
     Column("mean", "mean ± s.e.", with_error, "mean_error"),
@@ -123,9 +124,10 @@ def table(store: AnyStore, order: Orders | None = None) -> pd.DataFrame:
         - where the study requests [proximity]: the numbers of its metrics, by their names in `proximity`, and volume,
           smallest_angle and aspect_ratio; their lengths are in the unit of the files.
 
-        Numbers of a mesh that failed are NaN. The frame's ``attrs`` have the reference's label and, where there are
-        any, the study's rtol, the names of ``metadata``, and as ``computed`` the orders computed from the fields. Those
-        of several objects have what these share, and as ``left_out`` the names of objects without tables.
+        Numbers of a mesh that failed are NaN. The frame's ``attrs`` have the reference's label, the ``unit`` of the
+        files and, where there are any, the study's rtol, the names of ``metadata``, and as ``computed`` the orders
+        computed from the fields. Those of several objects have what these share, and as ``left_out`` the names of
+        objects without tables.
 
     Raises:
         InputError: The store has no tables yet.
@@ -204,6 +206,7 @@ def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
     frame.attrs = {key: convergence.attrs[key] for key in ("rtol", "computed") if key in convergence.attrs}
     if known := metadata_of(tree):
         frame.attrs["metadata"] = known
+    frame.attrs["unit"] = unit_of(tree)[0]
     return frame
 
 

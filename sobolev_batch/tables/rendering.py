@@ -85,10 +85,9 @@ def rendered(style: Format, frame: pd.DataFrame, sections: Iterable[Section], no
 
 
 def column_table(columns: Sequence[Column], rows: Rows, style: Format) -> str:
-    """Return rows of a frame as a table for people, with marks, and where numbers are absent; see `printed_table`.
-
-    Columns of texts that no row has are left out.
-    """
+    """Return rows of a frame as a table for people, with marks, and where numbers are absent; see `printed_table`."""
+    records = rows.to_dict(orient="records") if isinstance(rows, pd.DataFrame) else rows
+    columns = filled(columns, records)
     cells = [
         [
             "missing"
@@ -96,11 +95,15 @@ def column_table(columns: Sequence[Column], rows: Rows, style: Format) -> str:
             else column.text(row) + (_MARKS[row.get("mark", "")] if column.is_marked else "")
             for column in columns
         ]
-        for row in (rows.to_dict(orient="records") if isinstance(rows, pd.DataFrame) else rows)
+        for row in records
     ]
-    shown = [n for n, column in enumerate(columns) if column.kind != "text" or any(row[n] for row in cells)]
-    texts = [k for k, n in enumerate(shown) if columns[n].kind == "text"]
-    return printed_table([[row[n] for n in shown] for row in cells], [columns[n].header for n in shown], style, texts)
+    texts = [place for place, column in enumerate(columns) if column.kind == "text"]
+    return printed_table(cells, [column.header for column in columns], style, texts)
+
+
+def filled(columns: Sequence[Column], records: Sequence[Mapping[Any, Any]]) -> list[Column]:
+    """Return the columns that some row has, of texts those that some row has a text for."""
+    return [one for one in columns if any(one.text(row) if one.kind == "text" else one.name in row for row in records)]
 
 
 def machine_table(frame: pd.DataFrame, style: Format) -> str:

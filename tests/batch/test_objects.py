@@ -27,8 +27,9 @@ from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.store.records import ObjectRecord, Records
 from sobolev_batch.study.plan import Plan, make_plan
+from sobolev_batch.tables import conclusion
 from sobolev_batch.tables.conclusion import format_objects, format_verdict
-from sobolev_batch.tables.convergence import format_table
+from sobolev_batch.tables.convergence import format_table, tables_of
 from sobolev_batch.tables.smallest import format_smallest
 from tests.support.commands import call
 from tests.support.stores import flip
@@ -73,7 +74,7 @@ def test_objects_without_tables_are_named_beside_those_of_others(store: Path) ->
     frame, smallest = sb.table(store), sb.smallest_below(store, "5%")
     # What all objects share, without the units in which each was computed.
     assert frame.attrs == {"reference": "reference", "left_out": ["gone"]} | {
-        key: frame.attrs[key] for key in ("unit_length",) if key in frame.attrs
+        key: frame.attrs[key] for key in ("unit", "unit_length") if key in frame.attrs
     }
     assert smallest.attrs == {"reference": "reference", "below": 0.05, "left_out": ["gone"]}
     texts = (
@@ -751,6 +752,16 @@ def test_a_run_without_any_tables_says_so_and_ends_with_status_3(tmp_path: Path)
     assert (done.returncode, done.stdout.startswith("no league: there are no tables yet")) == (3, True)
 
 
+@pytest.mark.process
+def test_a_run_of_several_objects_says_why_meshes_failed(tmp_path: Path) -> None:
+    lost = {"name": "lost", "source": "files", "paths": ["nowhere.ply"]}
+    table = small_table(object=[*balls(a=1.0, b=1.1), GONE], family=[*methods_of(), lost])
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(table))
+    done = call("run", tmp_path / "study.toml", "--store", tmp_path / "s.zarr", "--workers", "1")
+    told = [line for line in done.stderr.splitlines() if line.startswith("a/lost/nowhere, b/lost/nowhere: ")]
+    assert (done.returncode, len(told)) == (3, 1)
+
+
 def test_verdicts_and_smallest_meshes_are_those_of_each_object(store: Path) -> None:
     smallest = sb.smallest_below(store, "50%", -3.0)
     assert smallest["object"].unique().tolist() == ["a", "b"]
@@ -787,3 +798,14 @@ def test_objects_are_listed_from_the_worst_one(store: Path) -> None:
         assert row["relative"] == pytest.approx(of_object["relative"].min(), rel=1e-14)
         assert (row["meshes"], row["missing"]) == (len(of_object), 0)
     assert f"{len(rows) - 1} more: sobolev-batch table objects {store}" in format_objects(store, most=1)
+    assert "deviation" not in format_objects(store)
+
+
+def test_the_largest_deviation_of_the_nearest_mesh_is_told(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = tables_of(store)
+    for frame in frames.values():
+        frame["hausdorff"], frame["hausdorff_upper"], frame.attrs["unit"] = frame["relative"], frame["relative"], "mm"
+    monkeypatch.setattr(conclusion, "tables_of", lambda *_: frames)
+    assert "; deviations are in mm" in format_objects(store)
+    rows = pd.read_csv(StringIO(format_objects(store, "csv")))
+    assert (rows["hausdorff"] == rows["relative"]).all()

@@ -124,7 +124,7 @@ def test_every_order_gets_a_table_and_small_numbers_are_formulas_of_latex(tree: 
 def test_programs_get_frames_nulls_and_blanks_for_missing_numbers(tree: xr.DataTree) -> None:
     frame = table(tree)
     assert (frame.attrs, frame["mesh"].tolist()) == (
-        {"reference": "reference", "unit_length": 1.0},
+        {"reference": "reference", "unit": "file units", "unit_length": 1.0},
         ["f_1/0", "f_1/1", "f_1/2"] * 2,
     )
     assert frame.query("order == -10 and level == 1")["relative"].item() == pytest.approx(0.025)

@@ -25,9 +25,17 @@ from sobolev_batch.extras.leagues.league import (
 )
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, TableRow, counted, study_verdict
-from sobolev_batch.tables.convergence import CONNECTION_COLUMNS, MESH, page_columns, tables_of, unit_notes, with_remarks
+from sobolev_batch.tables.convergence import (
+    CONNECTION_COLUMNS,
+    DEVIATION,
+    MESH,
+    page_columns,
+    tables_of,
+    unit_notes,
+    with_remarks,
+)
 from sobolev_batch.tables.open import doubts_of, finished_group, open_store, root_attribute, similarity_of
-from sobolev_batch.tables.rendering import Column
+from sobolev_batch.tables.rendering import Column, filled
 from sobolev_batch.tables.text import minus, number_text, percent
 from sobolev_batch.transform.lattice import Lattice
 
@@ -145,7 +153,7 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
         "lattice": Lattice(**settings["lattice"]),
         "similarity": similarity_of(tree),
         "sentences": sentences,
-        "verdict": PageTable("verdict", VERDICT_COLUMNS, rows, orders, is_sortable=False),
+        "verdict": PageTable("verdict", filled(VERDICT_COLUMNS, rows), rows, orders, is_sortable=False),
         "verdict_omitted": omitted,
         "convergence": convergence_table(tree, frame, families, MOST_CONVERGENCE_ROWS // convergence.sizes["order"]),
         "meshes": _meshes_table(meshes, families),
@@ -185,11 +193,15 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
         leagues, no_league = leagues_of(tables, objects.names), ""
     except InputError as error:
         leagues, no_league = (), str(error)
+    by_deviation: Sequence[League] = ()
+    with suppress(InputError):
+        by_deviation = leagues_of(tables, objects.names, y=DEVIATION.name)
     orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
     one = objects.location.below(objects.names[0])
     by_order = {league.order: league for league in leagues}
     of_objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
+    deviations = [row for league in by_deviation for row in _rows(league, "table")]
     methods = leagues[0].methods if leagues else list(dict.fromkeys(pd.concat(tables.values())["family"]))
     versions = root_attribute(open_store(objects.location.below(next(iter(tables)))), "versions")
     unfinished = {name: "it has no tables yet; run the study again" for name in objects.names if name not in tables}
@@ -203,6 +215,8 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
         "differences": tuple(tuple(pair_lines(one)) for one in leagues),
         "note": league_note(leagues).replace("\n", " ") if leagues else "",
         "league": PageTable("league", _LEAGUE_COLUMNS, ranked, [*by_order]),
+        "deviations": PageTable("deviations", league_columns(DEVIATION.name), deviations),
+        "unit": next(iter(tables.values())).attrs["unit"],
         "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, [*by_order]) if pairs else None,
         "objects": PageTable("objects", _OBJECT_COLUMNS, of_objects, orders),
         "omissions": [

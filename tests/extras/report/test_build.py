@@ -371,6 +371,23 @@ def test_a_study_with_costs_has_its_league_by_cost(store: str, monkeypatch: pyte
     assert table.count('<th scope="row"') == sum(len(league.table) for league in expected)
 
 
+def test_the_page_of_several_objects_has_their_largest_deviations(
+    objects: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert 'id="table-deviations"' not in make_report(objects)[0]
+    frames = tables_of(objects)
+    for frame in frames.values():
+        frame["hausdorff"], frame.attrs["unit"] = 10 / frame["triangles"], "mm"
+        frame["hausdorff_upper"] = frame["hausdorff"]
+    monkeypatch.setattr(content, "tables_of", lambda _: frames)
+    shown = make_report(objects)[0].split('id="table-deviations"')[1].split("</table>")[0]
+    (league,) = leagues_of(frames, [*frames], y="hausdorff")
+    assert [float(key) for key in re.findall(r'<td data-label="hausdorff" data-key="(.*?)"', shown)] == pytest.approx(
+        league.table["hausdorff"].tolist()
+    )
+    assert ", in mm" in shown
+
+
 @pytest.mark.slow
 def test_objects_without_league_say_why(objects: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:

@@ -54,9 +54,9 @@ def frame(meshes: Meshes, error: float = 1e-3, **changes: Any) -> pd.DataFrame:
 def verdict_on(made: pd.DataFrame, failed: dict[str, str] | None = None) -> tuple[str, dict[str, list[str]], str]:
     """Return the sentence at the first order, the texts of its rows, and what the table leaves out."""
     sentences, rows, omitted = study_verdict(made, failed or {})
+    columns = [one for one in VERDICT_COLUMNS[1:] if one.name != "hausdorff" or "hausdorff" in made]
     texts = {
-        row["verdict"]: [row["absent"]] if "absent" in row else [column.text(row) for column in VERDICT_COLUMNS[1:]]
-        for row in rows
+        row["verdict"]: [row["absent"]] if "absent" in row else [column.text(row) for column in columns] for row in rows
     }
     return sentences[0], texts, omitted
 
@@ -92,6 +92,19 @@ def test_few_meshes_and_surfaces_without_triangles() -> None:
     assert list(rows) == ["nearest of all", "below 5 %: a", "below 1 %: a"]
     _, rows, _ = verdict_on(frame([("a", 0, 0.1), ("b", 0, 0.2)]))
     assert rows == {"nearest of all": ["a/0", "10.00 % ± 0.01 %", "", "2 times nearer than b/0"]}
+
+
+def test_the_largest_deviation_of_the_nearest_mesh_is_told_in_the_unit_of_the_files() -> None:
+    made = frame([("a", 100, 0.2), ("a", 400, 0.04)])
+    made["hausdorff"], made["hausdorff_upper"], made.attrs["unit"] = [0.5, 0.25], [0.505, 0.2525], "mm"
+    sentence, rows, _ = verdict_on(made)
+    assert sentence.endswith(" The largest deviation of a/400 is 0.2500 to 0.2525 mm.")
+    assert rows["below 5 %: a"] == ["a/400", "4.000 % ± 0.004 %", "400", "0.2500 to 0.2525", ""]
+    # It may not be known of every mesh.
+    made.loc[1, ["hausdorff", "hausdorff_upper"]] = np.nan
+    sentence, rows, _ = verdict_on(made)
+    assert "deviation" not in sentence
+    assert rows["nearest of all"][3] == ""
 
 
 def test_errors_that_leave_a_place_open_are_said() -> None:
