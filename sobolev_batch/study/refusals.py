@@ -51,14 +51,16 @@ def validated(model: type[Sections], values: Mapping[str, Any]) -> Sections:
 
 
 def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
-    messages, allowed = list[str](), dict[_Key, list[str]]()
+    messages, allowed, told = list[str](), dict[_Key, list[str]](), set[str]()
     items = error.errors(include_url=False)
     # What is wrong with a named mesh is wrong wherever it is named.
     for item in [item for item in items if item["loc"][:1] == ("mesh",)] or items:
         kind, key = item["type"], _key_in(values, item)
         name = _named(key, values)
         if kind == "extra_forbidden":
-            messages.append(f"{name} is unknown; {known_names(str(key[-1]), _known_keys(values, key[:-1]))}")
+            hint = known_names(str(key[-1]), _known_keys(values, key[:-1]))
+            messages.append(f"{name} is unknown{f'; {hint}' * (hint not in told)}")
+            told.add(hint)
         elif kind == "missing":
             hint = f"; {MESH_HINT}" if key[-1] == "mesh" else ""
             messages.append(f"{name} is missing{hint}")

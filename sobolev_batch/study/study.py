@@ -274,7 +274,10 @@ class Study:
     @property
     def commands(self) -> tuple[str, ...]:
         """Commands that it runs to make its meshes, as a shell would have them, each once."""
-        return tuple(dict.fromkeys(command for source in self._sources for command in source.commands))
+        found = (
+            (str(one.folder.absolute()), source.commands) for one in self.objects.values() for source in one.sources
+        )
+        return tuple(dict.fromkeys(text.replace("{folder}", folder) for folder, commands in found for text in commands))
 
     @property
     def _sources(self) -> Iterator[Source]:

@@ -230,6 +230,10 @@ CHANGES: list[tuple[dict[str, Any], str]] = [
     ({"lattice": None, "accuracy": {"rtol": 0.1}, "transform": {"eps": 1e-9}}, r"an \[accuracy\] chooses eps"),
     ({"lattice": None}, r"either a \[lattice\] or an \[accuracy\] is needed"),
     ({"mesh": BALL, "reference": {"mesh": "ball", "colour": 1}}, "unknown; known are radius, center, source$"),
+    (
+        {"reference": {"source": "sphere", "colour": 1, "glow": 2}},
+        r"known are [\w, ]+; \[reference\]: glow is unknown$",
+    ),
     ({"mesh": BALL, "reference": "bal"}, r"^reference: no mesh is named 'bal'; did you mean ball\?$"),
 ]
 HIDDEN = ["a\nb", "a\x1b[31mb", "a\xa0b", "a\u202eb", "a\u200bb", "a\ud800b", " a"]
