@@ -23,7 +23,7 @@ from sobolev_batch.cli.output import echo, echo_lines, echo_result, progress_rep
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, cli
 from sobolev_batch.errors import InputError
 from sobolev_batch.plugins import COMMANDS, extra
-from sobolev_batch.shown import reasons
+from sobolev_batch.shown import reasons, together
 from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
@@ -112,8 +112,10 @@ def run_command(
     echo(str(summary).partition("\n")[0])
     if not tables:
         echo_lines(f"all distances: sobolev-batch table {visible(shlex.quote(summary.store))}", "shell")
-    for label, reason in summary.not_compared.items():
-        echo(f"{label}: {reason}", err=True)
+    # The verdict on an object has what failed, and objects that cannot be carried out were refused at once.
+    failed = {label: reason for label, reason in summary.failed.items() if not {"", label} & parsed.objects.keys()}
+    for _, line in reasons("", together(failed | dict(summary.not_compared))):
+        echo(line, err=True)
     what = "its distance has an error of {:.2g} %, more than the rtol of the study"
     for _, line in reasons("", {label: what.format(100 * error) for label, error in summary.imprecise.items()}):
         echo(line, err=True)

@@ -18,6 +18,8 @@ from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import number_text, percent, wrapped
 
 DEFAULT_COST = "make_seconds"
+# Why a league leaves an object out.
+LACKS_TABLES = "it has no tables; the command status tells why"
 # Members that a row of a table names, and objects whose fronts a text has.
 _MOST_MEMBERS, _MOST_OBJECTS = 4, 10
 COST_NOTE = """\
@@ -145,7 +147,7 @@ def cost_leagues_of(
     frame = frame[frame["family"].isin(methods) & (frame["cost"] > 0) & frame["relative"].notna()]
     if frame.empty:
         raise InputError(f"no mesh has both a distance and {x}; name another cost, such as triangles")
-    left_out = {name: "it has no tables yet" for name in objects if name not in tables}
+    left_out = {name: LACKS_TABLES for name in objects if name not in tables}
     for names, present in ((tables, {*frame["object"]}), (methods, {*frame["family"]})):
         left_out |= {name: f"no mesh has a distance and {x}" for name in names if name not in present}
     orders = dict.fromkeys(s for table in tables.values() for s in table["order"])

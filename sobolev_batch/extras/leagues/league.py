@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.extras.leagues import statistics
-from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of, objects_text
+from sobolev_batch.extras.leagues.costs import DEFAULT_COST, LACKS_TABLES, CostLeague, cost_leagues_of, objects_text
 from sobolev_batch.extras.leagues.statistics import EDGE_LENGTH, Curve, common_sizes
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.norms.columns import NUMBER, VARIABLES
@@ -300,7 +300,7 @@ def leagues_of(
     if x == y:
         raise InputError(f"all methods have the same {y} at equal {x}; choose another x, such as target_tolerance")
     chosen = chosen_methods(tables.values(), methods)
-    unfinished = dict.fromkeys((name for name in objects if name not in tables), "it has no tables yet")
+    unfinished = dict.fromkeys((name for name in objects if name not in tables), LACKS_TABLES)
     return tuple(_league(tables, s, x, y, chosen, unfinished) for s in orders_of(tables.values(), y))
 
 

@@ -146,7 +146,7 @@ def test_objects_that_cannot_be_compared_are_left_out_and_named(
     tables = {"x": POWERS, "y": method_rows(distances, error=0.03), "z": POWERS}
     (made,) = leagues_of(tables, [*tables, "later"])
     assert made.objects == ("x", "z")
-    assert made.left_out == {"later": "it has no tables yet", "y": reason}
+    assert made.left_out == {"later": "it has no tables; the command status tells why", "y": reason}
     assert f"y is left out: {reason}." in format_league([made])
     assert made.pairs["ratio"].item() == pytest.approx(0.5)
     np.testing.assert_allclose(made.table["rate"], 2.0)
@@ -348,7 +348,7 @@ def test_the_front_of_an_object_is_what_no_mesh_beats_in_both() -> None:
     assert made.meshes.loc[made.meshes["front"], "mesh"].tolist() == ["quick/1", "quick/2", "slow/20"]
     assert not made.meshes["undecided"].any()
     assert made.table["best"].tolist() == ["1, 2", "20"]
-    assert made.left_out == {"later": "it has no tables yet"}
+    assert made.left_out == {"later": "it has no tables; the command status tells why"}
 
 
 def test_no_object_costs_a_look_at_the_meshes_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
