@@ -112,6 +112,18 @@ def test_numbers_of_random_points_are_within_their_errors() -> None:
     assert np.mean(covered) >= 0.95
 
 
+@pytest.mark.parametrize("expected_points", [0.5, 2.0, 4.0])
+def test_errors_allow_for_a_spot_that_all_points_miss(expected_points: float) -> None:
+    flat, share = square(2.0), expected_points / 500
+    side, corners = 2 * np.sqrt(share / (1 - share)), square(1.0).vertices
+    vertices = [*flat.vertices, *(side * corners + [0, 0, 9.0])]
+    whole = sb.Mesh(np.array(vertices), [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    drawn = [proximity(whole, flat, points=500, seed=seed) for seed in range(60)]
+    for name, exact in (("mean", 9 * share), ("bias", 9 * share), ("rms", 9 * np.sqrt(share))):
+        assert min(found[name] for found in drawn) < 0.6 * exact
+        assert np.mean([abs(found[name] - exact) <= 2.58 * found[f"{name}_error"] for found in drawn]) >= 0.98
+
+
 def test_distances_of_vertices_as_another_search_finds_them() -> None:
     rng = np.random.default_rng(3)
     a, b = (
