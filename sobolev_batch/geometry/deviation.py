@@ -26,7 +26,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -55,9 +56,6 @@ _MANY, _MANY_OF_EACH = 1 << 17, 2
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
 # For so many pieces, with the farthest centers, the closest triangle to the worst corner, and covers, are searched.
 _FEW = 300
-# Parts of triangles: corners (3 corners, 3 coordinates, n), triangles (k, n) that may be close to each, and whether
-# covers of these parts, or of what they were cut from, were searched: where none was found, there hardly is one.
-_Pieces = tuple[Reals, Indices, bool]
 
 
 @dataclass(frozen=True)
@@ -184,6 +182,22 @@ class _Bounds:
             self.lower, self.place = float(distances[farthest]), points[:, farthest].copy()
 
 
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Parts of triangles: corners (3 corners, 3 coordinates, n), and triangles (k, n) that may be close to each.
+
+    Covers of these parts, or of what they were cut from, may have been searched: where none was, there hardly is one.
+    """
+
+    corners: Reals
+    close: Indices
+    is_searched: bool = False
+
+    def batches(self) -> Iterator[Self]:
+        for group in slices(self.corners.shape[2], _BATCH):
+            yield replace(self, corners=self.corners[..., group], close=self.close[:, group])
+
+
 def directed_deviation(
     mesh: Mesh, other: Triangles, gap: float = DEFAULT_GAP, within: float | None = None
 ) -> Deviation:
@@ -240,17 +254,17 @@ def _cut_all(mesh: Mesh, other: Triangles, bounds: _Bounds) -> Iterator[None]:
     order = np.argsort(-distances[mesh.triangles].max(axis=1), kind="stable")
     for batch in slices(len(order), _BATCH):
         corners = mesh.triangles[np.sort(order[batch])].T
-        pending = [(np.stack([vertices[:, corner] for corner in corners]), closest[corners], False)]
+        pending = [_Pieces(np.stack([vertices[:, corner] for corner in corners]), closest[corners])]
         while pending:
             # The last ones are cut to their end before the others, so that few are in memory.
-            parts, close, is_searched = _cut(pending.pop(), other, bounds)
-            pending += [(parts[..., some], close[:, some], is_searched) for some in slices(parts.shape[2], _BATCH)]
+            parts = _cut(pending.pop(), other, bounds)
+            pending += [] if parts is None else parts.batches()
             yield
 
 
-def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces:
-    """Bound the distances of pieces, and return the parts of those whose bound is too large."""
-    (corners, close, is_searched), count = pieces, pieces[0].shape[2]
+def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces | None:
+    """Bound the distances of pieces, and cut those whose bound is too large; None where there are none."""
+    corners, count = pieces.corners, pieces.corners.shape[2]
     bounds.count += count
     # For each piece the smallest upper bound, its triangle, and the squared distances of the corners from that.
     upper, best, squares = np.full(count, np.inf), np.full(count, -1), np.zeros((3, count))
@@ -266,7 +280,7 @@ def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces:
         upper[improved], best[improved], squares[:, improved] = largest[better], tried[better], found[:, better]
         return left[upper[left] > bounds.enough**2]
 
-    for tried in close:
+    for tried in pieces.close:
         left = look(tried[left])
     if len(left):
         centers = corners[..., left].mean(axis=0)
@@ -278,23 +292,25 @@ def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces:
     # No piece need be cut any more, whatever its bound.
     if bounds.count > _MOST_PIECES or (bounds.within is not None and bounds.lower > bounds.within + bounds.rounding):
         left = left[:0]
+    is_searched = pieces.is_searched
     if bounds.within is not None and not is_searched and len(left) >= _FEW:
         covers = cover_distances(corners[..., left], other, near[left], bounds.enough)
         upper[left] = np.minimum(upper[left], covers**2)
         left, is_searched = left[covers > bounds.enough], True
     bounds.upper = max(bounds.upper, math.sqrt(np.delete(upper, left).max(initial=0.0)))
     if not len(left):
-        return corners[..., left], close[:, left], is_searched
+        return None
     farthest = (-depths[left]).argsort()[:_FEW]
-    return *_parts(corners[..., left], best[left], np.sqrt(squares[:, left]), farthest, other, bounds), is_searched
+    parts = _parts(corners[..., left], best[left], np.sqrt(squares[:, left]), farthest, other, bounds)
+    return replace(parts, is_searched=is_searched)
 
 
 def _parts(
     corners: Reals, best: Indices, distances: Reals, farthest: Indices, other: Triangles, bounds: _Bounds
-) -> tuple[Reals, Indices]:
+) -> _Pieces:
     """Cut pieces, of corners at distances (3, n): along the plane through a side of the best triangle, or in two.
 
-    Those that two triangles bound together are left out. Return corners of the parts, and triangles close to them.
+    Those that two triangles bound together are left out.
     """
     pieces, worst = np.arange(len(best)), distances.argmax(axis=0)
     # How far each corner lies beyond each side, in lengths of the direction outward.
@@ -330,7 +346,7 @@ def _parts(
     near, far = np.stack([best, best]), np.stack([likely, best])
     is_lone = is_beyond[turned[0], pieces]
     alone, beside = np.where(is_lone, far, near)[:, is_cut], np.where(is_lone, near, far)[:, is_cut]
-    return np.concatenate(parts, axis=2), np.concatenate([alone] + [beside] * 2 + [far[:, halved]] * 2, axis=1)
+    return _Pieces(np.concatenate(parts, axis=2), np.concatenate([alone] + [beside] * 2 + [far[:, halved]] * 2, axis=1))
 
 
 def _crossings(values: Reals) -> tuple[Indices, Reals]:

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import shapely
@@ -39,9 +39,6 @@ _SIDE, _PROJECTION = np.array([0.4127, 0.7391, 0.5323]), np.array([0.4862, -0.38
 _FLAT = 2
 
 _Objects = NDArray[np.object_]
-# Of planes that were cut together: the area that was removed, numbers of those that were cut, their `areas` and
-# `distances` as in `Rests`, and the corners (k, 3, 3) of both rests.
-_Cut = tuple[float, Indices, Reals, Reals, Reals, Reals]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,33 +61,41 @@ def rests_of(first: Mesh, second: Mesh, tolerance: float = ROUNDING) -> Rests:
     low, high = Extent.union([first.extent, second.extent]).box
     center, size = low + (high - low) / 2, 2.0 ** np.ceil(np.log2((high - low).max()))
     reach = max(np.abs(low).max(), np.abs(high).max()) / size
-    sides = [_Side(mesh, center, size) for mesh in (first, second)]
+    sides = [_Side.of(mesh, center, size) for mesh in (first, second)]
     planes, of = _shared_planes(sides, tolerance * reach)
     cuts = _cut(sides, of, planes, ROUNDING * reach)
-    if sum(removed for removed, *_ in cuts) < _LEAST_FRACTION * sum(side.areas.sum() for side in sides):
+    if sum(cut.removed for cut in cuts) < _LEAST_FRACTION * sum(side.areas.sum() for side in sides):
         return Rests((first, second), np.zeros(0), np.zeros(0))
-    accepted, areas, distances, *corners = (
-        np.concatenate(some) for some in zip(*(found for _, *found in cuts), strict=True)
-    )
+    accepted = np.concatenate([cut.planes for cut in cuts])
     one, other = (
-        side.rest(np.isin(plane, accepted), uncovered, ROUNDING * reach)
-        for side, plane, uncovered in zip(sides, of, corners, strict=True)
+        side.rest(np.isin(plane, accepted), np.concatenate([cut.rests[number] for cut in cuts]), ROUNDING * reach)
+        for number, (side, plane) in enumerate(zip(sides, of, strict=True))
     )
+    areas, distances = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("areas", "distances"))
     return Rests((one, other), areas * size**2, distances * size)
 
 
+@dataclass(frozen=True, eq=False)
 class _Side:
     """One mesh, moved to a centre and divided by a size: planes (m, 4), least heights and areas of triangles (m,)."""
 
-    def __init__(self, mesh: Mesh, center: Reals, size: float) -> None:
-        self.mesh, self.center, self.size = mesh, center, size
+    mesh: Mesh
+    center: Reals
+    size: float
+    planes: Reals
+    heights: Reals
+    areas: Reals
+
+    @classmethod
+    def of(cls, mesh: Mesh, center: Reals, size: float) -> Self:
         count = len(mesh.triangles)
-        self.planes, (self.heights, self.areas) = np.zeros((count, 4)), np.zeros((2, count))
+        side = cls(mesh, center, size, np.zeros((count, 4)), np.zeros(count), np.zeros(count))
         for part in slices(count, _BATCH):
-            corners = self.corners(part)
-            normals, self.areas[part], self.heights[part] = _measured(corners)
-            self.planes[part, :3] = normals * np.where(normals @ _SIDE < 0, -1, 1)[:, None]
-            self.planes[part, 3] = np.einsum("ij,ij->i", self.planes[part, :3], corners[:, 0])
+            corners = side.corners(part)
+            normals, side.areas[part], side.heights[part] = _measured(corners)
+            side.planes[part, :3] = normals * np.where(normals @ _SIDE < 0, -1, 1)[:, None]
+            side.planes[part, 3] = np.einsum("ij,ij->i", side.planes[part, :3], corners[:, 0])
+        return side
 
     def corners(self, selection: slice | Indices) -> Reals:
         """Return the corners of some triangles (k, 3, 3)."""
@@ -180,9 +185,22 @@ def _planes_through(corners: Reals, clusters: Indices) -> Reals:
     return np.concatenate([normals, np.einsum("ij,ij->i", normals, first)[:, None]], axis=1)
 
 
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """Numbers of planes that were cut, the area that was removed, the corners of both rests (k, 3, 3), and `Rests`."""
+
+    planes: Indices
+    removed: float
+    rests: tuple[Reals, Reals]
+    areas: Reals
+    distances: Reals
+
+
 def _cut(sides: Sequence[_Side], of: Sequence[Indices], planes: Reals, rounding: float) -> list[_Cut]:
     """Cut planes, whose numbers triangles have, or -1 (m,); those that GEOS refuses are left out."""
-    batches, cuts = [np.arange(len(planes))] if len(planes) else [], []
+    if not len(planes):
+        return []
+    batches, cuts = [np.arange(len(planes))], []
     while batches:
         numbers = batches.pop()
         new = np.full(len(planes) + 1, -1)
@@ -201,20 +219,20 @@ def _cut_together(sides: Sequence[_Side], of: list[Indices], planes: Reals, numb
     first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
     first /= _lengths(first)[:, None]
     frames = np.stack([first, np.cross(normals, first)], axis=1)
-    sheets = [_projected(side, plane, planes, frames, grid) for side, plane in zip(sides, of, strict=True)]
-    depth = max(layers.shape[1] for *_, layers in sheets)
+    sheets = [_Sheet.of(side, plane, planes, frames, grid) for side, plane in zip(sides, of, strict=True)]
+    depth = max(sheet.layers.shape[1] for sheet in sheets)
     mine, others = (
         np.pad(layers, ((0, 0), (0, depth - layers.shape[1])), constant_values=shapely.Polygon())
-        for *_, layers in sheets
+        for layers in (sheets[0].layers, sheets[1].layers)
     )
     # Without corners on straight sides there are fewer triangles.
     remaining = (shapely.difference(*pair, grid_size=grid) for pair in ((mine, others), (others, mine)))
     rests = [shapely.simplify(polygons, rounding) for polygons in remaining]
     covered, left = ([shapely.area(one).sum(axis=1) for one in both] for both in ((mine, others), rests))
-    before, after, gaps = sheets[0][1] + sheets[1][1], left[0] + left[1], np.zeros(count)
+    before, after = sheets[0].areas + sheets[1].areas, left[0] + left[1]
     off = np.abs(covered[0] - covered[1] - left[0] + left[1])
     old, new, corners, rows = np.zeros(count), np.zeros(count), [], []
-    for (plane, own_areas, own_gaps, _), rest, whole, uncovered in zip(sheets, rests, covered, left, strict=True):
+    for sheet, rest, whole, uncovered in zip(sheets, rests, covered, left, strict=True):
         triangles, number = shapely.get_parts(shapely.constrained_delaunay_triangles(rest.ravel()), return_index=True)
         row = number // depth
         lifted = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3] @ frames[row]
@@ -222,52 +240,62 @@ def _cut_together(sides: Sequence[_Side], of: list[Indices], planes: Reals, numb
         _, areas, heights = _measured(lifted)
         is_thick = heights > _LEAST_HEIGHT * rounding
         kept = _sums(row, areas * is_thick, count)
-        off = np.maximum(off, np.maximum(np.abs(own_areas - whole), np.abs(kept - uncovered)))
-        old, new = old + np.bincount(plane, minlength=count), new + np.bincount(row, is_thick, count)
-        gaps = np.maximum(gaps, own_gaps)
+        off = np.maximum(off, np.maximum(np.abs(sheet.areas - whole), np.abs(kept - uncovered)))
+        old, new = old + np.bincount(sheet.plane, minlength=count), new + np.bincount(row, is_thick, count)
         corners.append(lifted[is_thick])
         rows.append(row[is_thick])
     is_cut = (off <= _BALANCE * before) & (new * after <= old * before) & (after < (1 - _LEAST_FRACTION) * before)
-    return (
-        float((before - after)[is_cut].sum()),
+    gaps = np.maximum(sheets[0].gaps, sheets[1].gaps)
+    return _Cut(
         numbers[is_cut],
+        float((before - after)[is_cut].sum()),
+        (corners[0][is_cut[rows[0]]], corners[1][is_cut[rows[1]]]),
         2 * depth * before[is_cut],
         np.where(gaps > rounding, gaps, 0.0)[is_cut],
-        *(found[is_cut[row]] for found, row in zip(corners, rows, strict=True)),
     )
 
 
-def _projected(
-    side: _Side, of: Indices, planes: Reals, frames: Reals, grid: float
-) -> tuple[Indices, Reals, Reals, _Objects]:
-    """Project the triangles of a mesh onto planes, from the number of the plane of each, or -1 (m,).
+@dataclass(frozen=True, eq=False)
+class _Sheet:
+    """One mesh, projected onto some planes.
 
-    Return the plane of each projected one, in ascending order (k,); for each plane their area and the largest distance
-    of a corner from it (planes,); and polygons, each inside the one before, that cover it as often as they do
-    (planes, layers).
+    Attributes:
+        plane: Number of the plane of each triangle (k,), in ascending order.
+        areas: Area of the triangles in each plane (planes,).
+        gaps: Largest distance of a corner from its plane (planes,).
+        layers: Polygons, each inside the one before, that cover a plane as often as triangles do (planes, layers).
     """
-    which = np.flatnonzero(of >= 0)
-    which = which[np.argsort(of[which], kind="stable")]
-    plane, corners, count = of[which], side.corners(which), len(planes)
-    polygons = shapely.polygons(corners @ frames[plane].transpose(0, 2, 1))
-    areas = _sums(plane, shapely.area(polygons), count)
-    gaps = np.zeros(count)
-    np.maximum.at(gaps, plane, _heights_above(corners, planes[plane]))
-    counts, sets = np.bincount(plane, minlength=count), shapely.multipolygons(polygons, indices=plane)
-    of_planes = np.split(polygons, np.cumsum(counts)[:-1])
-    for row in np.flatnonzero(counts > _MANY).tolist():
-        with suppress(GEOSException):
-            # It takes a sixth of the time, and holds where triangles share whole edges and do not overlap.
-            merged = shapely.coverage_union_all(of_planes[row])
-            sets[row] = merged if merged.is_valid else sets[row]
-    unions = shapely.union_all(sets[:, None], axis=1)
-    covered_often = np.flatnonzero(np.abs(shapely.area(unions) - areas) > _BALANCE * areas).tolist()
-    stacks = {row: _stack(of_planes[row], float(_BALANCE * areas[row]), grid) for row in covered_often}
-    layers = np.full((count, max([1, *map(len, stacks.values())])), shapely.Polygon(), dtype=object)
-    layers[:, 0] = unions
-    for row, stack in stacks.items():
-        layers[row, : len(stack)] = stack
-    return plane, areas, gaps, layers
+
+    plane: Indices
+    areas: Reals
+    gaps: Reals
+    layers: _Objects
+
+    @classmethod
+    def of(cls, side: _Side, of: Indices, planes: Reals, frames: Reals, grid: float) -> Self:
+        """Return the sheet of the triangles of a mesh, from the number of the plane of each, or -1 (m,)."""
+        which = np.flatnonzero(of >= 0)
+        which = which[np.argsort(of[which], kind="stable")]
+        plane, corners, count = of[which], side.corners(which), len(planes)
+        polygons = shapely.polygons(corners @ frames[plane].transpose(0, 2, 1))
+        areas = _sums(plane, shapely.area(polygons), count)
+        gaps = np.zeros(count)
+        np.maximum.at(gaps, plane, _heights_above(corners, planes[plane]))
+        counts, sets = np.bincount(plane, minlength=count), shapely.multipolygons(polygons, indices=plane)
+        of_planes = np.split(polygons, np.cumsum(counts)[:-1])
+        for row in np.flatnonzero(counts > _MANY).tolist():
+            with suppress(GEOSException):
+                # It takes a sixth of the time, and holds where triangles share whole edges and do not overlap.
+                merged = shapely.coverage_union_all(of_planes[row])
+                sets[row] = merged if merged.is_valid else sets[row]
+        unions = shapely.union_all(sets[:, None], axis=1)
+        covered_often = np.flatnonzero(np.abs(shapely.area(unions) - areas) > _BALANCE * areas).tolist()
+        stacks = {row: _stack(of_planes[row], float(_BALANCE * areas[row]), grid) for row in covered_often}
+        layers = np.full((count, max([1, *map(len, stacks.values())])), shapely.Polygon(), dtype=object)
+        layers[:, 0] = unions
+        for row, stack in stacks.items():
+            layers[row, : len(stack)] = stack
+        return cls(plane, areas, gaps, layers)
 
 
 def _sums(rows: Indices, values: Reals, count: int) -> Reals:
