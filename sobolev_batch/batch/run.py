@@ -134,10 +134,9 @@ def run(
     with ExitStack() as stack:
 
         def start() -> Client:
-            own = client is None
-            started = stack.enter_context(_own_cluster(study, location, workers, memory)) if own else client
+            started = client or stack.enter_context(_own_cluster(study, location, workers, memory))
             # Without bokeh, a cluster of this process has a page that says no more than that.
-            if not own or find_spec("bokeh"):
+            if client or find_spec("bokeh"):
                 notify(Progress("cluster", 0, 0, started.dashboard_link))
             families = (family for one in study.objects.values() for family in one.families)
             if searched := dict.fromkeys(one.name for one in families if isinstance(one.source, SearchedSource)):
