@@ -21,7 +21,7 @@ import sobolev_batch as sb
 from sobolev_batch.geometry.formats import parsing
 from sobolev_batch.sources import files
 from sobolev_batch.sources.command import CommandSource
-from sobolev_batch.tables.other_orders import convergence_at
+from sobolev_batch.tables.other_orders import table_at
 from sobolev_batch.transform import kinds
 from sobolev_batch.transform.exact import exact_transform
 from tests.support.commands import call, write_toml
@@ -243,11 +243,11 @@ def test_a_plan_that_looks_at_meshes_reads_none_of_them_twice(tmp_path: Path, co
 def test_the_command_builds_the_tables_that_it_prints_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[str] = []
 
-    def counted(tree: xr.DataTree, orders: Any) -> xr.Dataset:
+    def counted(tree: xr.DataTree, *arguments: Any) -> xr.Dataset:
         built.append(str(tree.attrs["title"]))
-        return convergence_at(tree, orders)
+        return table_at(tree, *arguments)
 
-    monkeypatch.setattr("sobolev_batch.tables.convergence.convergence_at", counted)
+    monkeypatch.setattr("sobolev_batch.tables.convergence.table_at", counted)
     done = call("run", write_toml(tmp_path), "--store", "memory://printed.zarr")
     assert "Verdict at order -10" in done.stdout
     assert built == ["small"]

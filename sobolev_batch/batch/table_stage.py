@@ -14,7 +14,7 @@ from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.tables.all_objects import Tables
 from sobolev_batch.tables.evaluator import Evaluator
 from sobolev_batch.tables.pairs import Pairs, fill_tile
-from sobolev_batch.tables.results import Placed, Results, coordinates_of, meshes_table, table_order
+from sobolev_batch.tables.results import Placed, coordinates_of, meshes_table, table_order, tables_from_spectra
 from sobolev_batch.tables.stored_spectra import fill_chunk, spectrum_keys, stale_chunks
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
@@ -69,24 +69,24 @@ def write_results(
     workspace: Workspace, evaluator: Evaluator, meshes: xr.Dataset, digest: str, replaced: Sequence[str]
 ) -> tuple[Tabulated, layout.Metadata]:
     """Write the tables that follow from stored spectra, the same each time, and return also the metadata then."""
-    store, results = workspace.store, Results.from_spectra(evaluator, meshes, workspace.plan.reference)
+    store, plan = workspace.store, workspace.plan
+    distances, tables = tables_from_spectra(evaluator, meshes, plan.reference, plan.study.accuracy)
     numerics = sorted({record.numerics for record in workspace.complete.values()})
-    convergence = results.convergence_table(workspace.plan.study.accuracy)
-    convergence.attrs |= {"digest": digest, layout.NUMERICS: numerics}
+    tables["convergence"].attrs |= {"digest": digest, layout.NUMERICS: numerics}
     replaced = [*replaced, *(layout.hide_tables(store) if _pairs(workspace) is None else ())]
     store.write(layout.QUALITY, [0], workspace.qualities)
-    layout.write_table(store, "meshes", results.meshes)
-    layout.write_table(store, "norms", results.norms_table())
+    layout.write_table(store, "meshes", meshes)
+    layout.write_table(store, "norms", tables["norms"])
     if layout.PAIRS_KEYS not in store.documents:
         if store.stored_document(layout.PAIRS_KEYS) is not None:
             store.location.remove(layout.DISTANCES)
-        layout.write_table(store, layout.DISTANCES, results.distances_table())
+        layout.write_table(store, layout.DISTANCES, tables["distances"])
     # This is written last: its digest says that all tables belong to the fields that are stored.
-    layout.write_table(store, "convergence", convergence)
+    layout.write_table(store, "convergence", tables["convergence"])
     for name in set(replaced) - store.documents.keys():
         store.location.remove(name)
     store.consolidate()
-    return Tabulated(results.to_reference, {"meshes": results.meshes, "convergence": convergence}), store.metadata
+    return Tabulated(distances, {"meshes": meshes, "convergence": tables["convergence"]}), store.metadata
 
 
 def _pairs(workspace: Workspace) -> Pairs | None:

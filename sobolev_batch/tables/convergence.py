@@ -28,7 +28,7 @@ from sobolev_batch.tables.open import (
     study_unit,
     unit_of,
 )
-from sobolev_batch.tables.other_orders import convergence_at, order_note
+from sobolev_batch.tables.other_orders import order_note, table_at
 from sobolev_batch.tables.rendering import Column, Section, machine_table, rendered
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -177,7 +177,7 @@ def _table(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
 def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
     """Return the rows of all meshes but references, of an object or, with its name and unit, of all objects."""
     meshes, of_all = finished_group(tree, "meshes"), has_objects(tree)
-    convergence = convergence_at(tree, order)
+    convergence = table_at(tree, "convergence", order)
     labels = convergence["mesh"].values
     others = labels != (convergence["reference"].values if of_all else reference_of(tree))
     about = [key for key in (*_ABOUT, *_MADE, *metadata_of(tree)) if key in meshes]

@@ -1,7 +1,7 @@
 """Norms and distances from stored fields: batches and tiles of rows, each one task over the store."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self
@@ -193,21 +193,14 @@ class Evaluator:
         That of the reference is (1, radii), or None without its field.
         """
         rows, b = list(rows), self.reference
-        tail = self._tail(spectra.norm, lambda row, _: self.qualities[row].own.at(self.orders), rows)
-        norms = self._estimate_by(spectra.norm, tail, self.areas[rows], self.errors[:, rows])
+        norms, tail = self._estimated(spectra.norm, rows)
         zeros, unknown = np.zeros_like(norms.values), np.full_like(norms.values, np.nan)
         beyond = zeros if tail is None else tail.remainder
         if b is None or reference is None:
             nothing = NormEstimate(*[unknown] * 5)
             return Compared(norms, nothing, ReferenceEstimate(nothing, unknown, unknown), (beyond, unknown))
-        of_b = self._tail(reference, lambda row, _: self.qualities[row].own.at(self.orders), [b])
-        norm_of_b = self._estimate_by(reference, of_b, self.areas[[b]], self.errors[:, [b]])
-        of_difference = self._tail(spectra.distance, lambda row, energies: self._remainder(row, b, energies), rows)
-        areas, errors = self.areas[rows] + self.areas[b], np.hypot(self.errors[:, rows], self.errors[:, [b]])
-        # The reference's distance to itself is zero, and nothing is uncertain about that.
-        errors *= np.not_equal(rows, b)
-        unseen = (self.beyond[:, rows] + self.beyond[:, [b]]) * np.not_equal(rows, b)
-        distances = self._estimate_by(spectra.distance, of_difference, areas, errors, unseen)
+        norm_of_b, of_b = self._estimated(reference, [b])
+        distances, of_difference = self._estimated(spectra.distance, rows, b)
         products = spectra.product(reference)
         of_product = Tail.of_product(self.axis.octave_integrals(products, self.orders), tail, of_b, of_difference)
         on_lattice = self._sums(products), self.weights, self.widths
@@ -215,17 +208,26 @@ class Evaluator:
         beyond_difference = zeros if of_difference is None else of_difference.remainder
         return Compared(norms, distances, against, (beyond, beyond_difference))
 
+    def _estimated(
+        self, spectra: Spectra, rows: list[int], other: int | None = None
+    ) -> tuple[NormEstimate, Tail | None]:
+        """Return the norms of rows (orders, rows), or their distances to another one, by their spectra; and tails."""
+        areas, errors, unseen = self.areas[rows], self.errors[:, rows], np.full(len(rows), np.nan)
+        if other is not None:
+            # The distance of a row to itself is zero, and nothing is uncertain about that.
+            areas, differ = areas + self.areas[other], np.not_equal(rows, other)
+            errors = np.hypot(errors, self.errors[:, [other]]) * differ
+            unseen = (self.beyond[:, rows] + self.beyond[:, [other]]) * differ
+        tail = None
+        if self.sampling is not None:
+            of_rows = zip(rows, self.axis.energies(spectra), strict=True)
+            beyond = np.array([self._remainder(row, other, energies) for row, energies in of_rows])
+            tail = Tail(*self.axis.octave_integrals(spectra, self.orders), *np.moveaxis(beyond, 0, -1))
+        images = spectra.images_at(self.orders)
+        return self._estimate(self._sums(spectra), tail, areas, errors, unseen, images), tail
+
     def _sums(self, spectra: Spectra) -> Sums:
         return sums_of_shells(spectra.sums[:, : self.lattice.shell_count], self.weights)
-
-    def _tail(
-        self, spectra: Spectra, remainder: Callable[[int, Sequence[float]], tuple[Reals, Reals]], rows: Sequence[int]
-    ) -> Tail | None:
-        """Return the tails (orders, rows), from spectra and from a function of a row and its energies in octaves."""
-        if self.sampling is None:
-            return None
-        found = [remainder(row, energies) for row, energies in zip(rows, self.axis.energies(spectra), strict=True)]
-        return Tail(*self.axis.octave_integrals(spectra, self.orders), *np.moveaxis(np.array(found), 0, -1))
 
     def only(self, rows: Iterable[int]) -> Self:
         """Return what is needed for some rows alone: of many rows, the rest is much to send."""
@@ -302,33 +304,20 @@ class Evaluator:
             for array in sums:
                 square = np.triu(array[..., :shared])
                 array[..., :shared] = square + np.swapaxes(np.triu(square, 1), -1, -2)
-        areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
-        errors = np.hypot(self.errors[:, list(rows)][:, :, None], self.errors[:, list(others)][:, None, :])
-        errors *= np.not_equal.outer(rows, others)
+        mine, theirs, differ = (..., [*rows], None), (..., None, [*others]), np.not_equal.outer(rows, others)
+        errors = np.hypot(self.errors[mine], self.errors[theirs]) * differ
         # By the triangle inequality, over the study's reference.
-        unseen = self.beyond[:, list(rows)][:, :, None] + self.beyond[:, list(others)][:, None, :]
-        unseen *= np.not_equal.outer(rows, others)
+        unseen = (self.beyond[mine] + self.beyond[theirs]) * differ
         tail = None if self.sampling is None else self._tails_of_pairs(self.sampling, rows, others, shared)
-        return self._estimate(sums, tail, areas, errors, unseen, self._images_of_pairs(sums, rows, others))
-
-    def _images_of_pairs(self, sums: Sums, rows: Sequence[int], others: Sequence[int]) -> Reals:
-        """Return bounds on what images add to squared distances of pairs (orders, rows, others), NaN if not known.
-
-        They add no more than what those of both differences from the reference add, and no more than all of the
-        difference would, at the least distance of faces to their images, of which the sum may have lost as much.
-        """
-        roots = self.images[:, list(rows)][:, :, None] + self.images[:, list(others)][:, None, :]
+        # Images add no more than what those of both differences from the reference add, and no more than all of the
+        # difference would, at the least distance of faces to their images, of which the sum may have lost as much.
         parts = np.array([image_weight(self.lattice.spacing, order - 1, self.widths) for order in self.orders])
-        most = np.divide(parts, 1 - parts, where=parts < 1, out=np.full_like(parts, 1e100))
-        return np.asarray(np.minimum(roots**2, most[:, None, None] * sums.totals))
-
-    def _estimate_by(
-        self, spectra: Spectra, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals | float = np.nan
-    ) -> NormEstimate:
-        return self._estimate(self._sums(spectra), tail, areas, errors, unseen, spectra.images_at(self.orders))
+        most = np.divide(parts, 1 - parts, where=parts < 1, out=np.full_like(parts, 1e100))[:, None, None]
+        images = np.minimum((self.images[mine] + self.images[theirs]) ** 2, most * sums.totals)
+        return self._estimate(sums, tail, self.areas[mine] + self.areas[theirs], errors, unseen, images)
 
     def _estimate(
-        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals | float, images: Reals
+        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals, images: Reals
     ) -> NormEstimate:
         """Return norms; areas and norms of the fields' own errors are those of both surfaces of a pair together.
 
@@ -411,12 +400,15 @@ class Evaluator:
         known = {row: quality.difference for row, quality in self.qualities.items()}
         return {row: difference.at(self.orders) for row, difference in known.items() if difference is not None}
 
-    def _remainder(self, row: int, other: int, measured: Sequence[float]) -> tuple[Reals, Reals]:
-        """Return what lies beyond the octaves in a squared distance (orders,), and how far off it may be.
+    def _remainder(self, row: int, other: int | None, measured: Sequence[float]) -> tuple[Reals, Reals]:
+        """Return what lies beyond the octaves in a squared norm or distance (orders,), and how far off it may be.
 
-        It is known to the reference. Else it is between bounds, which follow from the energies in the octaves, which
-        are measured, and those of both surfaces beyond; and, by the triangle inequality, from the known distances.
+        It is known of norms, and to the reference. Else it is between bounds, which follow from the energies in the
+        octaves, which are measured, and those of both surfaces beyond; and, by the triangle inequality, from the known
+        distances.
         """
+        if other is None:
+            return self.qualities[row].own.at(self.orders)
         for first, second in ((row, other), (other, row)):
             if second == self.known_reference and first in self._from_reference:
                 return self._from_reference[first]

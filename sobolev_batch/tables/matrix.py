@@ -6,14 +6,13 @@ from typing import Literal
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import PARTS, quotients
 from sobolev_batch.parameters import check_choice
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import AnyStore, as_tree, reference_of
-from sobolev_batch.tables.other_orders import distances_at, norms_at, order_note
+from sobolev_batch.tables.other_orders import distances_at, order_note, table_at
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import middle_cut, with_error
 from sobolev_batch.transform.lattice import single_order
@@ -88,8 +87,17 @@ def format_matrix(store: AnyStore, style: Format = "text", orders: Sequence[floa
 
 
 def _section(tree: xr.DataTree, distances: xr.Dataset) -> Section:
-    """Return the matrix of one order; a symmetric one has only the cells below its diagonal."""
-    values, errors, unit = _shown_numbers(tree, distances)
+    """Return the matrix of one order, in per cent of the norm of the reference if that is known.
+
+    A symmetric one has only the cells below its diagonal.
+    """
+    values, errors, order = distances["distance"].values, distances["error"].values, distances["order"].item()
+    unit, reference = "in the square root of a unit length", reference_of(tree)
+    if "norms" in tree.children:
+        norm = table_at(tree, "norms", order).sel(mesh=reference).squeeze("order")
+        if norm["norm"].notnull():
+            relative = quotients((values, errors), (norm["norm"].values, norm["error"].values))
+            values, errors, unit = 100 * relative[0], 100 * relative[1], f"in % of the norm of {reference}"
     labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
     is_symmetric = labels == others
     rows = [
@@ -102,15 +110,4 @@ def _section(tree: xr.DataTree, distances: xr.Dataset) -> Section:
     ]
     kept = {str(j): labels.index(other) + 1 for j, other in enumerate(others) if any(str(j) in row for row in rows)}
     columns = [Column("label", ""), *(Column(j, str(number)) for j, number in kept.items())]
-    return Section(f"Sobolev distances of order {distances['order'].item():g}, {unit}", [(columns, rows)])
-
-
-def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Reals, str]:
-    """Return the distances of one order, their errors, and the unit of both: the reference if it has a norm."""
-    values, errors = distances["distance"].values, distances["error"].values
-    if "norms" in tree.children:
-        norm = norms_at(tree, distances["order"].item()).sel(mesh=reference_of(tree)).squeeze("order")
-        relative, bounds = quotients((values, errors), (norm["norm"].values, norm["error"].values))
-        if norm["norm"].notnull():
-            return 100 * relative, 100 * bounds, f"in % of the norm of {reference_of(tree)}"
-    return values, errors, "in the square root of a unit length"
+    return Section(f"Sobolev distances of order {order:g}, {unit}", [(columns, rows)])

@@ -16,7 +16,7 @@ from sobolev_batch.store.workspace import complete_records, rows_unlike_tables
 from sobolev_batch.tables.evaluator import Evaluator
 from sobolev_batch.tables.open import finished_group, reference_of, require_unchanged, source_of, store_of
 from sobolev_batch.tables.pairs import known_distances
-from sobolev_batch.tables.results import Results, table_of
+from sobolev_batch.tables.results import table_of, tables_from_spectra
 from sobolev_batch.tables.stored_spectra import spectrum_keys, stale_chunks
 from sobolev_batch.transform.lattice import Orders, check_orders
 
@@ -50,8 +50,8 @@ def stored_evaluator(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Ev
     return Evaluator.for_fields(store, store.choice(), orders, qualities, checksums, reference, compared_with), rows
 
 
-def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = None) -> Results:
-    """Return norms, and distances to the reference, of meshes at orders that an open store lacks, from spectra."""
+def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes) -> dict[str, xr.Dataset]:
+    """Return the tables of meshes at orders that an open store lacks, from spectra, by group."""
     store, reference = store_of(tree), reference_of(tree)
     table = finished_group(tree, "meshes", load=False)
     if meshes is not None:
@@ -68,18 +68,18 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     texts = np.asarray(store.read(QUALITY, rows)).tolist() if rows else []
     qualities = dict(zip(rows, texts, strict=True))
     evaluator = Evaluator.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
-    return Results.from_spectra(evaluator, table, reference)
+    rtol = finished_group(tree, "convergence", load=False).attrs.get("rtol")
+    return tables_from_spectra(evaluator, table, reference, None if rtol is None else Accuracy(rtol))[1]
 
 
-def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
-    """Return the convergence table of an open store at some orders, of the store or not, in memory.
+def table_at(tree: xr.DataTree, group: str, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
+    """Return the table convergence or norms of an open store at some orders, of the store or not, in memory.
 
     The attribute ``computed`` lists the orders that were computed from radial spectra. The table may have more meshes
     than those that are needed. DamageError where a field is not what was stored.
     """
-    stored = finished_group(tree, "convergence", load=False)
-    accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
-    return _at_orders(tree, stored, order, lambda new: _computed(tree, new, meshes).convergence_table(accuracy)).load()
+    stored = finished_group(tree, group, load=False)
+    return _at_orders(tree, stored, order, lambda new: _computed(tree, new, meshes)[group]).load()
 
 
 def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
@@ -88,21 +88,15 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     labels = meshes["mesh"].values
     stored = finished_group(tree, "distances", load=False).drop_vars("key", errors="ignore").sel(mesh=labels)
     if stored.sizes["other"] != stored.sizes["mesh"]:
-        return _at_orders(tree, stored, order, lambda new: _computed(tree, new).distances_table())
-    return _at_orders(tree, stored.sel(other=labels), order, lambda new: _pairs_at(tree, meshes, new))
+        return _at_orders(tree, stored, order, lambda new: _computed(tree, new, None)["distances"])
 
+    def compute(others: tuple[float, ...]) -> xr.Dataset:
+        evaluator, _ = stored_evaluator(tree, others)
+        rows: list[int] = meshes["row"].values.tolist()
+        found = known_distances(evaluator, rows, rows, set(evaluator.complete)).named("distance")
+        return describe(table_of(found, meshes, others, "mesh", "other").assign_coords(other=labels))
 
-def _pairs_at(tree: xr.DataTree, meshes: xr.Dataset, others: tuple[float, ...]) -> xr.Dataset:
-    evaluator, _ = stored_evaluator(tree, others)
-    rows: list[int] = meshes["row"].values.tolist()
-    found = known_distances(evaluator, rows, rows, set(evaluator.complete)).named("distance")
-    return describe(table_of(found, meshes, others, "mesh", "other").assign_coords(other=meshes["mesh"].values))
-
-
-def norms_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
-    """Return the norms of an open store's meshes at some orders, in memory; see `convergence_at`."""
-    stored = finished_group(tree, "norms", load=False)
-    return _at_orders(tree, stored, order, lambda new: _computed(tree, new, meshes).norms_table()).load()
+    return _at_orders(tree, stored.sel(other=labels), order, compute)
 
 
 def require_fields(tree: xr.DataTree, table: xr.Dataset, meshes: Sequence[str]) -> None:

@@ -5,8 +5,8 @@ In the order of tables, families are as in the study, and the meshes of each fro
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Literal, Self
+from dataclasses import fields
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -144,95 +144,62 @@ def _are_graded(counts: Sequence[int]) -> bool:
 
 def _key(criterion: Criterion, row: Row, triangles: int | None) -> tuple[Any, ...]:
     """Return what a row is sorted by; where it is equal, names decide. A mesh that failed has no known triangles."""
-    name = natural_key(row.member.name)
-    if criterion == "time":
-        return math.inf if row.member.time is None else row.member.time, name
-    if criterion == "level":
-        return row.member.level, name
-    if criterion == "triangles":
-        return math.inf if triangles is None else triangles, name
-    return (name,)
+    known = {"time": row.member.time, "level": row.member.level, "triangles": triangles, "names": 0}[criterion]
+    return math.inf if known is None else known, natural_key(row.member.name)
 
 
-@dataclass(frozen=True, eq=False)
-class Results:
-    """The results of a study in the order of tables, NaN where there are none.
+def tables_from_spectra(
+    evaluator: Evaluator, meshes: xr.Dataset, reference: str, accuracy: Accuracy | None
+) -> tuple[NormEstimate, dict[str, xr.Dataset]]:
+    """Return distances to the reference (orders, meshes), and the tables that follow from stored spectra by group.
 
-    Attributes:
-        norms, to_reference: Norms, and distances to the reference, each (orders, meshes).
-        parts: (4, orders, meshes), the distance's parts of area and shape, each with its error; see `AREA_AND_SHAPE`.
-        beyond: (2, orders, meshes), see `Compared`.
+    They are in the order of the table of meshes, with NaN where there are no numbers: in norms `norm` (mesh, order), in
+    distances `distance` (mesh, other, order), whose only other is the reference, each with its error, and in
+    convergence distances, relative ones and their parts, and observed orders of convergence.
     """
-
-    meshes: xr.Dataset
-    reference: str
-    orders: tuple[float, ...]
-    norms: NormEstimate
-    to_reference: NormEstimate
-    parts: Reals
-    beyond: Reals
-
-    @classmethod
-    def from_spectra(cls, evaluator: Evaluator, meshes: xr.Dataset, reference: str) -> Self:
-        """Return norms, and distances to the reference, from the spectra that the evaluator's store holds."""
-        count, orders = meshes.sizes["mesh"], len(evaluator.orders)
-        arrays = [np.full((parts, orders, count), np.nan) for parts in (5, 5, 4, 2)]
-        places = {row: place for place, row in enumerate(meshes["row"].values.tolist())}
-        complete = {row for row in evaluator.complete if row in places}
-        b = evaluator.reference
-        of_reference = None if b is None else read_spectra(evaluator.store, [b]).norm
-        for chunk in chunks_of_spectra(evaluator.store):
-            if rows := [row for row in chunk if row in complete]:
-                found = evaluator.norms_of(rows, read_spectra(evaluator.store, rows), of_reference)
-                parts = [*found.reference.area_and_shape(found.distances).values()]
-                of_rows = [places[row] for row in rows]
-                numbers = found.norms.stacked, found.distances.stacked, np.stack(parts), np.stack(found.beyond)
-                for array, values in zip(arrays, numbers, strict=True):
-                    array[..., of_rows] = values
-        norms, to_reference, *others = arrays
-        return cls(meshes, reference, evaluator.orders, NormEstimate(*norms), NormEstimate(*to_reference), *others)
-
-    def norms_table(self) -> xr.Dataset:
-        """Return `norm` (mesh, order) with its error."""
-        return table_of({**self.norms.named("norm"), "beyond": self.beyond[0]}, self.meshes, self.orders)
-
-    def distances_table(self) -> xr.Dataset:
-        """Return `distance` (mesh, other, order) with its error; the only other is the reference."""
-        distances = {name: values[:, :, None] for name, values in self.to_reference.named("distance").items()}
-        table = table_of(distances, self.meshes, self.orders, "mesh", "other")
-        return describe(table.assign_coords(other=("other", np.array([self.reference], dtype=object))))
-
-    def convergence_table(self, accuracy: Accuracy | None) -> xr.Dataset:
-        """Return distances to the reference, relative ones and their parts, and observed orders of convergence."""
-        sizes = self.meshes["edge_length_mean"].to_numpy()
-        reference = self.meshes.indexes["mesh"].get_loc(self.reference)
-        distances, errors = self.to_reference.values, self.to_reference.errors
-        families, ordered_by = (self.meshes[name].values for name in ("family", "ordered_by"))
-        rates, rate_errors = rates_in_families(families, ordered_by, distances, errors, sizes)
-        columns = {
-            **self.to_reference.named("distance"),
-            **self.to_reference.relative_to(NormEstimate(*self.norms.stacked[..., [reference]])),
-            **dict(zip(AREA_AND_SHAPE, self.parts, strict=True)),
-            "beyond": self.beyond[1],
-            "rate": rates,
-            "rate_error": rate_errors,
-            "resolved": errors < distances,
-            "within": np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(self.to_reference),
-        }
-        attributes = {"reference": self.reference, **({} if accuracy is None else {"rtol": accuracy.rtol})}
-        return table_of(columns, self.meshes, self.orders).assign_attrs(attributes)
-
-
-def rates_in_families(
-    families: NDArray[Any], ordered_by: NDArray[Any], distances: Reals, errors: Reals, sizes: Reals
-) -> Reals:
-    """Return observed rates and their errors (2, orders, meshes); NaN in families that are not from coarse to fine."""
-    rates, is_ordered = np.full((2, *distances.shape), np.nan), np.isin(ordered_by, FROM_COARSE_TO_FINE)
+    norms, distances, parts, beyond = _from_spectra(evaluator, meshes["row"].values.tolist())
+    at_reference = meshes.indexes["mesh"].get_loc(reference)
+    families, ordered_by, sizes = (meshes[name].values for name in ("family", "ordered_by", "edge_length_mean"))
+    # There are no rates in families that are not from coarse to fine.
+    rates, is_ordered = np.full((2, *distances.values.shape), np.nan), np.isin(ordered_by, FROM_COARSE_TO_FINE)
     for family in dict.fromkeys(families[is_ordered].tolist()):
         members = is_ordered & (families == family)
-        for k in range(len(distances)):
-            rates[:, k, members] = observed_rates(distances[k, members], errors[k, members], sizes[members])
-    return rates
+        for k, (values, errors) in enumerate(zip(distances.values, distances.errors, strict=True)):
+            rates[:, k, members] = observed_rates(values[members], errors[members], sizes[members])
+    columns = {
+        **distances.named("distance"),
+        **distances.relative_to(NormEstimate(*norms.stacked[..., [at_reference]])),
+        **dict(zip(AREA_AND_SHAPE, parts, strict=True)),
+        "beyond": beyond[1],
+        "rate": rates[0],
+        "rate_error": rates[1],
+        "resolved": distances.errors < distances.values,
+        "within": np.ones_like(distances.values, dtype=bool) if accuracy is None else accuracy.met(distances),
+    }
+    attributes = {"reference": reference, **({} if accuracy is None else {"rtol": accuracy.rtol})}
+    to_one = {name: values[:, :, None] for name, values in distances.named("distance").items()}
+    other = "other", np.array([reference], dtype=object)
+    return distances, {
+        "norms": table_of({**norms.named("norm"), "beyond": beyond[0]}, meshes, evaluator.orders),
+        "distances": describe(table_of(to_one, meshes, evaluator.orders, "mesh", "other").assign_coords(other=other)),
+        "convergence": table_of(columns, meshes, evaluator.orders).assign_attrs(attributes),
+    }
+
+
+def _from_spectra(evaluator: Evaluator, rows: Sequence[int]) -> tuple[NormEstimate, NormEstimate, Reals, Reals]:
+    """Return norms of rows, distances, the `AREA_AND_SHAPE` of these (4, orders, rows), and `Compared.beyond`."""
+    arrays = [np.full((parts, len(evaluator.orders), len(rows)), np.nan) for parts in (5, 5, 4, 2)]
+    places = {row: place for place, row in enumerate(rows)}
+    complete, b = places.keys() & evaluator.complete, evaluator.reference
+    of_reference = None if b is None else read_spectra(evaluator.store, [b]).norm
+    for chunk in chunks_of_spectra(evaluator.store):
+        if known := [row for row in chunk if row in complete]:
+            found = evaluator.norms_of(known, read_spectra(evaluator.store, known), of_reference)
+            parts = np.stack([*found.reference.area_and_shape(found.distances).values()])
+            numbers = found.norms.stacked, found.distances.stacked, parts, np.stack(found.beyond)
+            for array, values in zip(arrays, numbers, strict=True):
+                array[..., [places[row] for row in known]] = values
+    return NormEstimate(*arrays[0]), NormEstimate(*arrays[1]), arrays[2], arrays[3]
 
 
 def table_of(columns: Columns, meshes: xr.Dataset, orders: Sequence[float], *dimensions: str) -> xr.Dataset:

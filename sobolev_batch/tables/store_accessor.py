@@ -1,5 +1,7 @@
 """`tree.sobolev`: norms, distances and spectra of any order from all that a store holds."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import xarray as xr
 
@@ -10,7 +12,7 @@ from sobolev_batch.norms.estimate import AREA_AND_SHAPE
 from sobolev_batch.parameters import as_names
 from sobolev_batch.tables.evaluator import Evaluator
 from sobolev_batch.tables.open import complete_meshes, finished_group, reference_of, similarity_of
-from sobolev_batch.tables.other_orders import Meshes, convergence_at, norms_at, require_fields, stored_evaluator
+from sobolev_batch.tables.other_orders import Meshes, require_fields, stored_evaluator, table_at
 from sobolev_batch.tables.results import table_of
 from sobolev_batch.transform.lattice import Orders, check_orders, smooth_step
 
@@ -62,7 +64,7 @@ class StoreAccessor:
         >>> tree.sobolev.norm([-4, -3.5])["norm"].sizes
         Frozen({'mesh': 5, 'order': 2})
         """
-        return self._chosen(norms_at(self._tree, check_orders(order), mesh).drop_vars("beyond"), order, mesh)
+        return self._chosen(table_at(self._tree, "norms", check_orders(order), mesh).drop_vars("beyond"), order, mesh)
 
     def distance(self, order: Orders, mesh: Meshes = None, other: str | None = None) -> xr.Dataset:
         """Return distances of meshes with their errors, relative to the other mesh, and in parts of area and shape.
@@ -90,7 +92,7 @@ class StoreAccessor:
         Frozen({'mesh': 5})
         """
         if other is None or other == reference_of(self._tree):
-            table = convergence_at(self._tree, check_orders(order), mesh)
+            table = table_at(self._tree, "convergence", check_orders(order), mesh)
             return self._chosen(table[[name for name in _OF_DISTANCES if name in table]], order, mesh)
         meshes = finished_group(self._tree, "meshes")
         labels = complete_meshes(self._tree) if mesh is None else as_names(mesh)
@@ -136,8 +138,7 @@ class StoreAccessor:
         1.0
         """
         evaluator, indices = stored_evaluator(self._tree, order, *([mesh] if other is None else [mesh, other]))
-        bands = [*_inner_bands(evaluator, indices), *_octaves(evaluator, indices)]
-        upper, squares, energies, deviations = (np.array(column) for column in zip(*bands, strict=True))
+        upper, squares, energies, deviations = map(np.array, zip(*_bands(evaluator, indices), strict=True))
         lower = np.array([0.0, *upper[:-1]])
         dims, values, _ = axis = order_axis(order)
         squared = squares.T.reshape(*values.shape, -1)
@@ -156,27 +157,22 @@ class StoreAccessor:
         )
 
 
-def _inner_bands(evaluator: Evaluator, rows: list[int]) -> list[Band]:
-    lattice = evaluator.lattice
+def _bands(evaluator: Evaluator, rows: list[int]) -> Iterator[Band]:
+    """Yield the bands of a field or of the difference of two: those of the lattice, then the octaves."""
+    lattice, sampling = evaluator.lattice, evaluator.sampling
     count = max(1, (lattice.M // (2 * _FEWEST_SPACINGS)).bit_length())
     cutoffs = lattice.xi_max / 2.0 ** np.arange(count)[::-1]
     radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))
     windows = np.diff([smooth_step(radii, cutoff) for cutoff in cutoffs], axis=0, prepend=0.0)
     sums, upper = evaluator.sums_over_shells(rows), _HALF_WEIGHT * cutoffs
     energies = windows @ sums / np.diff(upper, prepend=0.0)
-    if evaluator.sampling is None:
+    if sampling is None:
         # No octave takes over from the last band.
         windows[-1], upper[-1] = 1 - windows[:-1].sum(axis=0), lattice.xi_max
     squares = windows * sums @ (1 + radii[:, None] ** 2) ** evaluator.orders
-    return [(*ends, 0.0) for ends in zip(upper.tolist(), squares, energies.tolist(), strict=True)]
-
-
-def _octaves(evaluator: Evaluator, rows: list[int]) -> list[Band]:
-    if evaluator.sampling is None:
-        return []
-    values = [evaluator.read_octaves(row) for row in rows]
-    sums = evaluator.octave_sums(values[0] - values[1] if len(rows) > 1 else values[0])
-    return [
-        (_HALF_WEIGHT * sampling.octave.highest, one.squares, one.energy, one.energy_deviation)
-        for sampling, one in zip(evaluator.sampling.octaves, sums, strict=True)
-    ]
+    yield from ((*ends, 0.0) for ends in zip(upper.tolist(), squares, energies.tolist(), strict=True))
+    if sampling is not None:
+        values = [evaluator.read_octaves(row) for row in rows]
+        of_octaves = evaluator.octave_sums(values[0] - values[1] if len(rows) > 1 else values[0])
+        for own, one in zip(sampling.octaves, of_octaves, strict=True):
+            yield _HALF_WEIGHT * own.octave.highest, one.squares, one.energy, one.energy_deviation

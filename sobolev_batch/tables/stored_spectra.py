@@ -35,17 +35,13 @@ def stale_chunks(store: Store, keys: Mapping[int, str]) -> dict[int, range]:
     missing, stale = missing_chunks(store, SPECTRA_KEYS), dict[int, range]()
     for number, rows in enumerate(chunks_of_spectra(store)):
         expected = {row: keys[row] for row in rows if row in keys}
-        if (number,) in missing or (expected and not expected.items() <= _stored_keys(store, rows).items()):
+        texts: list[str] = []
+        if expected and (number,) not in missing:
+            with suppress(DamageError):
+                texts = np.asarray(store.read(SPECTRA_KEYS, slice(rows.start, rows.stop))).tolist()
+        if (number,) in missing or not expected.items() <= dict(zip(rows, map(key_in, texts), strict=False)).items():
             stale[number] = rows
     return stale
-
-
-def _stored_keys(store: Store, rows: range) -> dict[int, str]:
-    """Return the keys of the rows of a chunk that have spectra; none if the chunk is damaged."""
-    with suppress(DamageError):
-        stored = np.asarray(store.read(SPECTRA_KEYS, slice(rows.start, rows.stop))).tolist()
-        return {row: key_in(text) for row, text in zip(rows, stored, strict=True) if text}
-    return {}
 
 
 def fill_chunk(evaluator: Evaluator, number: int, keys: Mapping[int, str]) -> None:

@@ -11,7 +11,7 @@ from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.norms.columns import NUMBER, VARIABLES, described
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, reference_of
-from sobolev_batch.tables.other_orders import convergence_at
+from sobolev_batch.tables.other_orders import table_at
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -60,14 +60,7 @@ def evolution(store: AnyStore, order: Orders | None = None, *, factor: float = R
     """
     if not is_finite_number(factor) or factor <= 1:
         raise InputError(f"the factor must be larger than 1, found {factor!r}")
-    tree = as_tree(store)
-    convergence, meshes = convergence_at(tree, order), _moving_meshes(tree)
-    orders, frames = convergence["order"].values.tolist(), []
-    for row in meshes.itertuples(index=False):
-        numbers = {name: convergence[name].sel(mesh=row.mesh).values for name in _NUMBERS}
-        frames.append(pd.DataFrame({"family": row.family, "time": row.time, "order": orders, **numbers}))
-    table: xr.Dataset = pd.concat(frames, ignore_index=True).set_index(["family", "time", "order"]).to_xarray()
-    found = table.reindex(family=meshes["family"].unique().tolist(), time=sorted(meshes["time"].unique()), order=orders)
+    found = _over_time(as_tree(store), order)
     for name in (*_NUMBERS, "time", "order"):
         found[name].attrs = VARIABLES[name]
     found["family"].attrs = described("family of meshes")
@@ -112,15 +105,16 @@ def has_times(tree: xr.DataTree) -> bool:
     return "time" in finished_group(tree, "meshes", load=False).coords
 
 
-def _moving_meshes(tree: xr.DataTree) -> pd.DataFrame:
-    """Return mesh, family and time of the meshes with times, but for the reference."""
-    group = finished_group(tree, "meshes")
-    columns = {name: group[name].values for name in ("mesh", "family", "time") if has_times(tree)}
-    meshes = pd.DataFrame(columns, columns=["mesh", "family", "time"]).dropna(subset="time")
-    meshes = meshes[meshes["mesh"] != reference_of(tree)].drop_duplicates(["family", "time"], keep="last")
-    if meshes.empty:
+def _over_time(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
+    """Return the numbers of the meshes with times, but for the reference, over family, time and order."""
+    table = table_at(tree, "convergence", order).drop_sel(mesh=reference_of(tree)).reset_coords()
+    if not has_times(tree) or not (moving := table.dropna("mesh", subset=["time"])).sizes["mesh"]:
         raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
-    return meshes
+    families, times = moving["family"].values, moving["time"].values
+    places = pd.MultiIndex.from_arrays([families, times], names=["family", "time"])
+    along = xr.Coordinates.from_pandas_multiindex(places, "mesh")
+    found = moving[[*_NUMBERS]].drop_vars("mesh").assign_coords(along).isel(mesh=~places.duplicated(keep="last"))
+    return found.unstack("mesh").reindex(family=pd.unique(families)).transpose("family", "time", "order")
 
 
 def _cell(found: xr.Dataset) -> str:
