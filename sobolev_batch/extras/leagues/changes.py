@@ -95,7 +95,10 @@ def compare_studies(
     chosen = chosen_methods(chain(*tables.values()), methods)
     frames = []
     for name, pair in tables.items():
-        _require_same_reference(name, *trees[name])
+        now, before = trees[name]
+        if now.attrs["similarity"] != before.attrs["similarity"] or _identity(now) != _identity(before):
+            what = f"{name or 'the studies'}: different references or units of length cannot be compared"
+            raise InputError(f"{what}; give both the same [reference] and [scaling]")
         new_rows, old_rows = (frame[frame["family"].isin(chosen)] for frame in pair)
         frames += [_joined(name, new_rows, old_rows, column, lost) for column in columns]
     joined = pd.concat(frames, ignore_index=True)
@@ -110,12 +113,6 @@ def compare_studies(
     result.insert(9, "verdict", np.where(result["p"] < statistics.SIGNIFICANCE, words, "undecided"))
     result.attrs["lost"] = tuple(dict.fromkeys(lost))
     return result
-
-
-def _require_same_reference(name: str, new: xr.DataTree, old: xr.DataTree) -> None:
-    if new.attrs["similarity"] != old.attrs["similarity"] or _identity(new) != _identity(old):
-        what = f"{name or 'the studies'}: different references or units of length cannot be compared"
-        raise InputError(f"{what}; give both the same [reference] and [scaling]")
 
 
 def _joined(name: str, new: pd.DataFrame, old: pd.DataFrame, y: str, lost: list[str]) -> pd.DataFrame:

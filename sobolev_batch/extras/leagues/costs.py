@@ -150,15 +150,9 @@ def cost_leagues_of(
     left_out = {name: LACKS_TABLES for name in objects if name not in tables}
     for names, present in ((tables, {*frame["object"]}), (methods, {*frame["family"]})):
         left_out |= {name: f"no mesh has a distance and {x}" for name in names if name not in present}
-    orders = dict.fromkeys(s for table in tables.values() for s in table["order"])
-    return tuple(_cost_league(frame[frame["order"] == s], s, x, methods, left_out) for s in orders)
-
-
-def _cost_league(
-    frame: pd.DataFrame, order: float, x: str, methods: Sequence[str], left_out: Mapping[str, str]
-) -> CostLeague:
     # A name that objects do not share may hold that of its object.
-    is_own = (frame.groupby("mesh")["object"].transform("nunique") == 1) & (frame["object"].nunique() > 1)
+    is_own = frame.groupby(["order", "mesh"])["object"].transform("nunique") == 1
+    is_own &= frame.groupby("order")["object"].transform("nunique") > 1
     names = [mesh.removeprefix(f"{family}/") for mesh, family in zip(frame["mesh"], frame["family"], strict=True)]
     triples = zip(names, frame["object"], is_own, strict=True)
     members = [name.replace(owner, "{object}") if own else name for name, owner, own in triples]
@@ -166,7 +160,7 @@ def _cost_league(
     relative = frame["relative"].clip(lower=NEXT_TO_EQUAL)
     meshes = frame.assign(method=frame["family"], member=members, relative=relative, **{x: frame["cost"]})
     parts = []
-    for _, own in meshes.groupby("object", sort=False):
+    for _, own in meshes.groupby(["order", "object"], sort=False):
         costs, error = own[x], own["relative_error"].fillna(np.inf)
         low, high = own["relative"] - error, own["relative"] + error
         front = _is_unbeaten(costs, own["relative"], own["relative"])
@@ -174,8 +168,10 @@ def _cost_league(
         at_worst, at_best = _is_unbeaten(costs, high, low), _is_unbeaten(costs, low, high)
         parts.append(own.assign(front=front, undecided=at_worst != at_best))
     columns = ["object", "method", "member", "mesh", x, "relative", "relative_error", "front", "undecided"]
-    made = pd.concat(parts, ignore_index=True)[columns]
-    return CostLeague(order, x, tuple(dict.fromkeys(made["object"])), tuple(methods), left_out, made)
+    return tuple(
+        CostLeague(s, x, tuple(rows["object"].unique()), tuple(methods), left_out, rows[columns].reset_index(drop=True))
+        for s, rows in pd.concat(parts).groupby("order", sort=False)
+    )
 
 
 def objects_text(count: int) -> str:

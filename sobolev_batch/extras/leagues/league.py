@@ -408,14 +408,10 @@ def format_league(leagues: Sequence[League], style: Format = "text") -> str:
 def league_note(leagues: Sequence[League]) -> str:
     """Return how to read leagues at one size; of a single method, nothing on ranks and pairs."""
     ranks = _RANKS_NOTE if any(len(one.methods) > 1 for one in leagues) else ""
-    numbers = ", ".join(dict.fromkeys(_in_units(one.y) for one in leagues))
+    # Tables do not show the units of numbers.
+    units = {one.y: VARIABLES.get(one.y, {}).get("units", NUMBER) for one in leagues}
+    numbers = ", ".join(y if unit == NUMBER else f"{y} in {unit}" for y, unit in units.items())
     return _MEANS_NOTE.format(x=leagues[0].x, y=numbers) + ranks
-
-
-def _in_units(y: str) -> str:
-    """Return the name of a column with the units of its numbers, if they have any that tables do not show."""
-    units = VARIABLES.get(y, {}).get("units", NUMBER)
-    return y if units == NUMBER else f"{y} in {units}"
 
 
 def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
