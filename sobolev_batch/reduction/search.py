@@ -124,17 +124,15 @@ class Search:
     def bracket(self, trials: Sequence[Trial]) -> Bracket:
         """Return what trials say."""
         sign = self._sign(trials)
-        # Of equal meshes the one of the coarsest size.
-        within = [one for one in trials if one.is_within]
-        best = min(within, key=lambda one: (one.triangles, -sign * one.size), default=None)
         ordered = sorted(trials, key=lambda one: sign * one.size)
-        beside = zip([None, *ordered], ordered, [*ordered[1:], None], strict=False)
+        # Of equal meshes the one of the coarsest size.
+        best = min((one for one in ordered[::-1] if one.is_within), key=lambda one: one.triangles, default=None)
+        coarser = ordered if best is None else ordered[ordered.index(best) + 1 :]
         # Those that failed alone do not say where the limit is met, but where none is coarser.
-        told = [one for finer, one, coarser in beside if coarser is None or not _is_only_failure(finer, one, coarser)]
-        others = [one for one in told if not one.is_within]
-        coarser = (one for one in others if best is None or sign * one.size > sign * best.size)
+        told = (one for one in coarser if one is ordered[-1] or not _failed_alone(one, ordered))
         made = [one for one in ordered if one.triangles]
-        return Bracket(best, next(coarser, None), all(a.lower <= b.upper for a, b in combinations(made, 2)))
+        is_monotone = all(a.lower <= b.upper for a, b in combinations(made, 2))
+        return Bracket(best, next((one for one in told if not one.is_within), None), is_monotone)
 
     def next(self, trials: Sequence[Trial], count: int = 1) -> tuple[float, ...]:
         """Return sizes to try now, up to a count of them at a time; none where the search is over."""
@@ -168,10 +166,11 @@ class Search:
 
     def _again(self, trials: Sequence[Trial], bracket: Bracket, sign: int) -> tuple[float, ...]:
         """Return a size beyond the coarsest one where only that failed, and a finer one, if any, holds."""
-        finer, last = [None, None, *sorted(trials, key=lambda one: sign * one.size)][-2:]
-        is_open = last is not None and bracket.failed == last and (finer is None or bracket.best is not None)
-        if last is None or not is_open or not _is_only_failure(finer, last, None):
+        ordered = sorted(trials, key=lambda one: sign * one.size)
+        is_open = ordered and bracket.failed == ordered[-1] and (len(ordered) == 1 or bracket.best is not None)
+        if not is_open or not _failed_alone(ordered[-1], ordered):
             return ()
+        last = ordered[-1]
         size = last.size * math.exp(sign * _BEYOND * math.log1p(self.precision))
         size = float((math.ceil if sign > 0 else math.floor)(size)) if self.is_whole else size
         size = min(max(size, self.low), self.high)
@@ -235,9 +234,10 @@ class Search:
         return float(min(max(round(size), min(finer, coarser)), max(finer, coarser)))
 
 
-def _is_only_failure(finer: Trial | None, trial: Trial, coarser: Trial | None) -> bool:
-    """Tell whether a trial failed, and those beside it that were made, if any, did not."""
-    return not trial.has_distance and all(one is None or one.has_distance for one in (finer, coarser))
+def _failed_alone(trial: Trial, ordered: Sequence[Trial]) -> bool:
+    """Tell whether a trial failed, and those beside it, if any, did not."""
+    place = ordered.index(trial)
+    return [one for one in ordered[max(place - 1, 0) : place + 2] if not one.has_distance] == [trial]
 
 
 def _extrapolated(points: Mapping[float, float], end: float) -> float:
