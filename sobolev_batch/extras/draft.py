@@ -140,11 +140,10 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         if {path, references[name]} <= extents.keys()
         if (doubt := placement_doubt(extents[path], extents[references[name]]))
     }
-    if "" in references:
-        sections, summary = _one_object(references[""], families, sizes, below)
+    if families and "" not in references:
+        sections, summary = _several_objects(references, families, below, base)
     else:
-        alone = () if families else _originals(references, sizes, below)
-        sections, summary = alone or _several_objects(references, families, below, base)
+        sections, summary = _one_reference(references, families, sizes, below)
     lacks = "no other mesh belongs to it by name, nor it to one"
     left_out |= {str(path): lacks for path in sizes if path not in used}
     name = _json(_free_name(folder.resolve().name, fallback="study"))
@@ -234,7 +233,7 @@ def _references(sizes: Mapping[PurePosixPath, int], *, are_all: bool = False) ->
     """
     called = [path for path in sizes if are_all or _is_called_reference(path)]
     references = {_object_of(path): path for path in called} or _continued(sizes)
-    owners = {name for name, *_ in _owned(sizes, references)}
+    owners = {name for name, _ in _families(sizes, references)}
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called or references)
     is_refused = any(name_problem(name, _LONGEST_NAME, RESERVED) or name.startswith((".", "__")) for name in references)
     if not are_different or is_refused:
@@ -272,29 +271,36 @@ def _continued(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
 
 def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]) -> _Families:
     """Return the files of each object and family, which is that of their folder or of their name."""
-    owned = _owned(paths, references)
+    known, taken = {caseless_key(name): name for name in references}, {*references.values()}
+    # The object of each file that has one, and what its name says beside that of the object.
+    owned: dict[PurePosixPath, tuple[str, str]] = {}
+    for path in paths:
+        names = ((known.get(caseless_key(name)), rest) for name, rest in _names_in(path) if path not in taken)
+        if first := next(((name, rest) for name, rest in names if name is not None), None):
+            owned[path] = first
     # Objects and sizes have folders of their own, which say nothing of families.
     own = {name: {*map(caseless_key, (name, *(one.parent.parts if name else ())))} for name, one in references.items()}
-    folders = [
-        [part for part in path.parent.parts if not _SIZE.fullmatch(part) and caseless_key(part) not in own[name]]
-        for name, path, _ in owned
-    ]
-    shared = sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
-    wanted = []
-    for (_, _, rest), parts in zip(owned, folders, strict=True):
+    folders = {
+        path: [part for part in path.parent.parts if not _SIZE.fullmatch(part) and caseless_key(part) not in own[name]]
+        for path, (name, _) in owned.items()
+    }
+    shared = sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders.values(), strict=False)))
+    wanted = {}
+    for path, (_, rest) in owned.items():
         # With slashes, or the families of a/b and "a b" would be one.
         named = _SIZE.sub("", rest).strip(_BETWEEN)
         # Numbers alone, as those of dates, are no name.
         named = named if any(map(str.isalpha, named)) else ""
-        wanted.append("/".join(parts[shared:]) or named or "".join(parts[-1:]))
+        wanted[path] = "/".join(folders[path][shared:]) or named or "".join(folders[path][-1:])
     families: dict[tuple[str, str], list[PurePosixPath]] = {}
-    counts, names = Counter(wanted), dict[str, str]()
-    for (name, path, _), parts, family in zip(owned, folders, wanted, strict=True):
+    counts, free = Counter(wanted.values()), dict[str, str]()
+    for path, family in wanted.items():
         # Meshes of one object that are alone, in no folder of their own, are a family together.
-        family = "" if not name and not parts[shared:] and counts[family] == 1 else family
-        if family not in names:
-            names[family] = _free_name(family, names.values())
-        families.setdefault((name, names[family]), []).append(path)
+        is_alone = not owned[path][0] and not folders[path][shared:] and counts[family] == 1
+        family = "" if is_alone else family
+        if family not in free:
+            free[family] = _free_name(family, free.values())
+        families.setdefault((owned[path][0], free[family]), []).append(path)
     return families
 
 
@@ -303,18 +309,6 @@ def _object_of(reference: PurePosixPath) -> str:
     rest = _REFERENCE.sub("", mesh_stem(reference)).strip(_BETWEEN)
     own = [part for part in reference.parent.parts if not _REFERENCE.search(part) and not _REFERENCES.fullmatch(part)]
     return rest or "".join(own[-1:])
-
-
-def _owned(
-    paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]
-) -> list[tuple[str, PurePosixPath, str]]:
-    """Return the object of each file that has one, the file, and what its name says beside that of the object."""
-    known, others = {caseless_key(name): name for name in references}, dict.fromkeys(paths)
-    for reference in references.values():
-        del others[reference]
-    named = (((known.get(caseless_key(name)), path, rest) for name, rest in _names_in(path)) for path in others)
-    firsts = (next(((name, path, rest) for name, path, rest in one if name is not None), None) for one in named)
-    return [*filter(None, firsts)]
 
 
 def _names_in(path: PurePosixPath) -> Iterator[tuple[str, str]]:
@@ -336,18 +330,29 @@ def _names_in(path: PurePosixPath) -> Iterator[tuple[str, str]]:
     yield "", stem
 
 
-def _one_object(
-    reference: PurePosixPath, families: _Families, sizes: Mapping[PurePosixPath, int], folder: PurePosixPath
+def _one_reference(
+    references: Mapping[str, PurePosixPath],
+    families: _Families,
+    sizes: Mapping[PurePosixPath, int],
+    folder: PurePosixPath,
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Return the sections of a study of one object, and what they hold."""
-    path, triangles = str(folder / reference), sizes[reference]
+    """Return the sections of a study of one object, or of originals alone, which decimates them; and what they hold."""
+    shown = {str(folder / one).replace(name or OBJECT, OBJECT) for name, one in references.items()}
+    path, triangles = shown.pop(), min(sizes[one] for one in references.values())
     counts = [count for part in _FRACTIONS if (count := triangles // part) >= _FEWEST_TRIANGLES]
-    if not families and not counts:
+    if (reference := references.get("")) is not None:
         too_small = f"too small to decimate ({triangles} triangles)"
-        raise StudyError(f"{reference} is the only mesh that can be read, and {too_small}; add other meshes")
-    remark = "its name says so" if _is_called_reference(reference) else "the mesh with the most triangles"
+        problem = f"{reference} is the only mesh that can be read, and {too_small}; add other meshes"
+        remark = "its name says so" if _is_called_reference(reference) else "the mesh with the most triangles"
+        summary = [f"reference {path}, {triangles:,} triangles"]
+    else:
+        names, example = few_of([*map(str, references.values())]), f"METHOD/{next(iter(references))}_500.ply"
+        problem = f"there are originals alone ({names}); add meshes with their names, such as {example}"
+        remark = "new files of this kind are objects too"
+        summary = [f"{_objects_text(references)}, each compared with decimated versions of itself"]
+    if shown or not (families or counts):
+        raise StudyError(problem)
     sections = [_filled("reference", remark=remark, path=_json(path))]
-    summary = [f"reference {path}, {triangles:,} triangles"]
     for (_, family), members in families.items():
         ends = dict.fromkeys(f"{end(sizes[member] for member in members):,}" for end in (min, max))
         size = f"{_count(len(members))}, {' to '.join(ends)} triangles"
@@ -360,20 +365,6 @@ def _one_object(
     if counts:
         sections.append(_filled("optional" if families else "decimated", counts=counts))
     return sections, tuple(summary)
-
-
-def _originals(
-    references: Mapping[str, PurePosixPath], sizes: Mapping[PurePosixPath, int], folder: PurePosixPath
-) -> tuple[list[str], tuple[str, ...]]:
-    """Return the sections of a study of originals alone, which decimates them, and what they hold."""
-    path, *others = {str(folder / path).replace(name, OBJECT) for name, path in references.items()}
-    counts = [count for part in _FRACTIONS if (count := min(sizes.values()) // part) >= _FEWEST_TRIANGLES]
-    if others or not counts:
-        names, example = few_of([*map(str, references.values())]), f"METHOD/{next(iter(references))}_500.ply"
-        raise StudyError(f"there are originals alone ({names}); add meshes with their names, such as {example}")
-    summary = f"{_objects_text(references)}, each compared with decimated versions of itself"
-    remark = "new files of this kind are objects too"
-    return [_filled("reference", remark=remark, path=_json(path)), _filled("decimated", counts=counts)], (summary,)
 
 
 def _several_objects(
