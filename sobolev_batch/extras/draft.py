@@ -20,7 +20,7 @@ from sobolev_batch.geometry.formats.readers import expected_size, read_mesh
 from sobolev_batch.geometry.surface import Extent, placement_doubt
 from sobolev_batch.parameters import path_of
 from sobolev_batch.shown import Shown, few_of, reasons, together
-from sobolev_batch.sources.files import MOST_MESHES
+from sobolev_batch.sources.files import MOST_MESHES, FileMember
 from sobolev_batch.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 from sobolev_batch.study.schema import REFERENCE_LABEL, RESERVED
 from sobolev_batch.study.study import Study
@@ -401,9 +401,8 @@ def _names_these(sections: Sequence[str], listed: Iterable[tuple[str, str, str]]
     with suppress(StudyError, MeshError):
         text = _filled("study", name=_json("patterns"), sections="\n".join(sections))
         study = Study.from_table(tomllib.loads(text), folder=base)
-        sources = {(name, family.name): family.source for name, one in study.objects.items() for family in one.families}
-        sources |= {(name, REFERENCE_LABEL): one.reference for name, one in study.objects.items()}
-        found = ((*key, member.path) for key, source in sources.items() for member in source.members(base))
+        members = ((name, *member) for name, one in study.objects.items() for member in one.members.values())
+        found = ((name, family, member.path) for name, family, member in members if isinstance(member, FileMember))
         return sorted(found) == sorted((name, method, (base / path).absolute()) for name, method, path in listed)
     return False
 
