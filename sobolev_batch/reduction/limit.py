@@ -120,41 +120,37 @@ class Limit:
     def bounds(self, mesh: Mesh, reference: Mesh) -> tuple[float, float, float]:
         """Return an estimate of the distance of a mesh from a reference, a lower and an upper bound.
 
-        That of a score is what it lacks to one.
+        That of a score is what it lacks to one. MeshError where the measure is not known.
         """
         if self.is_score:
             numbers = sampled_numbers(Triangles(mesh), Triangles(reference), signed=False)
             lower, upper = (max(0.0, 1 - score) for score in _score_ends(numbers, self.measure))
             return upper, lower, upper
-        if self.order is None and not self.measure.startswith(HAUSDORFF):
-            value, error = self._value(mesh, reference)
-            # The upper bound decides, so it guides the search too.
-            return value + error, max(0.0, value - error), value + error
-        if self.order is None:
+        if self.order is not None:
+            to_unit = Similarity.to_unit_ball(reference)
+            pair = to_unit.apply(mesh), to_unit.apply(reference)
+            found, _ = relative_distance(*pair, self.order, self.value, _ANY_ACCURACY, _THREADS, _SEED)
+            # Of a distance that is too large, hardly any lies beyond the lattice.
+            guess = found.upper if found.upper > self.value else (found.lower + found.upper) / 2
+            return found.lower if found.lower > self.value else guess, found.lower, found.upper
+        if self.measure.startswith(HAUSDORFF):
             ways = largest_deviation(mesh, reference, within=self.value)
             deviation = getattr(ways, self.measure.removeprefix(HAUSDORFF).removeprefix("_") or "both")
             # The lower bound is at least the distance of any vertex; the upper one falls hardly below the limit.
             return deviation.lower, deviation.lower, deviation.upper
-        to_unit = Similarity.to_unit_ball(reference)
-        pair = to_unit.apply(mesh), to_unit.apply(reference)
-        found, _ = relative_distance(*pair, self.order, self.value, _ANY_ACCURACY, _THREADS, _SEED)
-        # Of a distance that is too large, hardly any lies beyond the lattice.
-        guess = found.upper if found.upper > self.value else (found.lower + found.upper) / 2
-        return found.lower if found.lower > self.value else guess, found.lower, found.upper
-
-    def _value(self, mesh: Mesh, reference: Mesh) -> tuple[float, float]:
-        """Return the size of the measure and how far it may be off at 99 %; MeshError where it is not known."""
         if self.measure in _OF_ONE_MESH:
             own, other = (getattr(one, self.measure) for one in (mesh, reference))
             value, error = abs(own - other) / (abs(other) or math.nan), 0.0
         else:
             numbers = sampled_numbers(Triangles(mesh), Triangles(reference), signed=self.measure == "bias")
             value = abs(numbers[self.measure])
+            # How far it may be off at 99 %.
             error = float(quantile(DEFAULT_POINTS - 1)) * numbers[f"{self.measure}_error"]
         if math.isnan(value):
             causes = reference.defects or mesh.defects or ("it is zero, or vertices are double",)
             raise MeshError(f"no {self.measure} is known: {', '.join(causes)}")
-        return value, error
+        # The upper bound decides, so it guides the search too.
+        return value + error, max(0.0, value - error), value + error
 
 
 def _score_ends(numbers: Mapping[str, float], measure: str) -> Iterator[float]:

@@ -64,26 +64,25 @@ def matrix(
     return frame
 
 
-def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
-    """Return the distances of one order in long form, with their errors: one row for each pair of meshes."""
-    chosen = parts_as_variables(distances.sel(order=order))[[*_COLUMNS]].load()
-    return chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()[["order", "mesh", "other", *_COLUMNS]]
+def matrix_frame(distances: xr.Dataset) -> pd.DataFrame:
+    """Return distances in long form, with their errors: one row for each order and pair of meshes."""
+    names = ["order", "mesh", "other"]
+    return parts_as_variables(distances).to_dataframe(dim_order=names).reset_index()[[*names, *_COLUMNS]]
 
 
 def format_matrix(store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None) -> str:
     """Return the distance matrices of a store as text; InputError where they are too large for people."""
     tree = as_tree(store)
     distances = distances_at(tree, orders)
-    chosen = list(dict.fromkeys(distances["order"].values.tolist()))
     count = distances.sizes["mesh"]
     if count > _MOST_MESHES and style not in ("csv", "json"):
         raise InputError(f"a matrix of {count} meshes is too large to be read as {style}; take --format csv or json")
-    frame = pd.concat([matrix_frame(distances, order) for order in chosen])
-    sections = (_section(tree, distances.sel(order=order).load()) for order in chosen)
+    distances.load()
+    sections = (_section(tree, distances.sel(order=order)) for order in distances["order"].values)
     notes = [_NOTE]
     if "computed" in distances.attrs:
         notes += order_note(tree, distances.attrs["computed"])
-    return rendered(style, frame, sections, notes)
+    return rendered(style, matrix_frame(distances), sections, notes)
 
 
 def _section(tree: xr.DataTree, distances: xr.Dataset) -> Section:

@@ -75,25 +75,20 @@ class Verdict(Shown):
         return self.outcome == "same"
 
     def __str__(self) -> str:
-        number = f"relative distance {self._number} at order {self.order:g}"
+        if self.error <= _WIDEST * self.distance:
+            amount = percent(self.distance, self.error)
+        else:
+            lower, upper = rounded_outwards(100 * self.lower, 100 * self.upper)
+            amount = f"at most {upper} %" if self else f"from {lower} to {upper} %"
+        tolerance = f"tolerance {100 * self.tolerance:g} %"
+        number = f"relative distance {amount} at order {self.order:g}"
+        if self.outcome == "undecided":
+            return f"undecided: {number}, which does not tell it from {tolerance}; take another"
+        if self.outcome == "same":
+            return f"same surface: {number}, within {tolerance}"
         change = 100 * self.area_change
         area = f"area {change:+,.0f} %" if abs(change) >= _WHOLE else f"area {change:+.2g} %"
-        doubt, tolerance = f"; {self.doubt}" if self.doubt else "", f"tolerance {100 * self.tolerance:g} %"
-        match self.outcome:
-            case "same":
-                return f"same surface: {number}, within {tolerance}"
-            case "different":
-                return f"different surfaces: {number}, above {tolerance}; {area}{doubt}"
-            case "undecided":
-                return f"undecided: {number}, which does not tell it from {tolerance}; take another"
-
-    @property
-    def _number(self) -> str:
-        """The distance in per cent with its error, or its bounds where these are far apart."""
-        if self.error <= _WIDEST * self.distance:
-            return percent(self.distance, self.error)
-        lower, upper = rounded_outwards(100 * self.lower, 100 * self.upper)
-        return f"at most {upper} %" if self.outcome == "same" else f"from {lower} to {upper} %"
+        return "; ".join(filter(None, (f"different surfaces: {number}, above {tolerance}", area, self.doubt)))
 
 
 def same_surface(

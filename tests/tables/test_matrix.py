@@ -27,7 +27,7 @@ def made(count: int, failed: int = 1) -> xr.DataTree:
 
 
 def test_frame_becomes_the_matrix() -> None:
-    frame = matrix_frame(distances_at(made(4), None), -2.0)
+    frame = matrix_frame(distances_at(made(4), -2.0))
     assert frame.columns.tolist()[:4] == ["order", "mesh", "other", "distance"]
     pivoted = frame.pivot(index="mesh", columns="other", values="distance")
     public = matrix(made(4), -2.0)
@@ -82,7 +82,7 @@ def test_programs_get_lines_of_pairs() -> None:
 def test_distances_to_the_reference_alone() -> None:
     tree = made(4)
     tree["distances"] = xr.DataTree(tree["distances"].to_dataset().sel(other=["reference"]))
-    assert len(matrix_frame(distances_at(tree, None), -4.0)) == 5
+    assert len(matrix_frame(distances_at(tree, -4.0))) == 5
     assert "\n3 f/2        3.00 ± 0.03\n" in format_matrix(tree, "text", [-4.0])
 
 

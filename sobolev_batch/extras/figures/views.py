@@ -1,7 +1,7 @@
 """Meshes with their witness functions, or distances of vertices, for display: simplified, and in plots."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -185,7 +185,14 @@ def make_views(
     if len(named) > most_meshes:
         raise InputError(f"at most {most_meshes} meshes can be shown, found {len(named)}")
     chosen = tuple(finished_group(tree, "convergence")["order"].values.tolist() if orders is None else orders)
-    labels = named or tuple(_extremes(tree, chosen[0], chosen_families(tree, family)))
+    labels = named
+    if not named:
+        frame = table(tree, chosen[0])
+        is_chosen = frame["family"].isin(chosen_families(tree, family))
+        frame = frame[is_chosen & (frame["distance"] > 0) & (frame["triangles"] > 0)]
+        of_families = frame.groupby("family", sort=False)["distance"]
+        extremes = dict.fromkeys([*of_families.idxmin(), *of_families.idxmax()])
+        labels = tuple(frame.loc[[*extremes][:_MOST_EXTREMES], "mesh"])
     try:
         study_meshes = StudyMeshes.from_tree(tree, folder)
     except InputError as error:
@@ -225,15 +232,6 @@ def up_axis(points: Reals) -> Axis:
     points = (points - low) / extent
     y, z = (MultiPoint(np.delete(points[points[:, axis] <= _BASE], axis, axis=1)).convex_hull.area for axis in (1, 2))
     return "y" if y > max(_BROAD, _BROADER * z) else "z"
-
-
-def _extremes(tree: xr.DataTree, order: float, families: Sequence[str]) -> Iterator[str]:
-    """Yield the mesh of each of some families that is closest to the reference, then those that are farthest."""
-    frame = table(tree, order)
-    frame = frame[frame["family"].isin(families) & (frame["distance"] > 0) & (frame["triangles"] > 0)]
-    groups = [rows for _, rows in frame.groupby("family", sort=False)]
-    extremes = [rows["distance"].idxmin() for rows in groups] + [rows["distance"].idxmax() for rows in groups]
-    yield from frame.loc[list(dict.fromkeys(extremes))[:_MOST_EXTREMES], "mesh"]
 
 
 def _view(label: str, fields: Fields, mesh: Mesh, orders: tuple[float, ...], most: int) -> MeshView:
