@@ -48,7 +48,7 @@ def convergence(
         order: Order of the norm.
         ax: Axes to draw on.
         family: Families to draw.
-        x: Horizontal axis: "edge_length" (mean, in the study's unit), "triangles", "vertices", "seconds" that the
+        x: Horizontal axis: "edge_length" (mean, in the unit of the files), "triangles", "vertices", "seconds" that the
             tasks of the mesh took, or a number among the metadata of the meshes.
 
     >>> import sobolev_batch as sb

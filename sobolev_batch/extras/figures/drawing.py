@@ -40,8 +40,8 @@ from sobolev_batch.extras.leagues.evolution import evolution, has_times
 from sobolev_batch.extras.leagues.league import RELATIVE, League
 from sobolev_batch.extras.leagues.statistics import label_of, sizes_of
 from sobolev_batch.shown import few_of
-from sobolev_batch.tables.convergence import table
-from sobolev_batch.tables.open import complete_meshes, finished_group, reference_of, study_unit
+from sobolev_batch.tables.convergence import table, with_remarks
+from sobolev_batch.tables.open import complete_meshes, finished_group, reference_of, study_unit, unit_of
 
 # More labels along a front would overlap.
 _MOST_LABELS = 20
@@ -63,11 +63,11 @@ _PERCENTILES = (2.0, 98.0)
 
 def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
     """Draw the relative distances of one order against the size or the cost of the meshes, family by family."""
-    frame = table(selection.tree, order)
+    frame = with_remarks(table(selection.tree, order))
     frame = frame[frame["family"].isin(selection.families)]
     frame = frame.assign(x=sizes_of(frame, selection.x))
     drawn = frame[(frame["relative"] > 0) & (frame["x"] > 0)]
-    set_log_scale(axes, "xy")
+    set_log_scale(axes, "xy", " %")
     sequences = []
     for name, rows in drawn.groupby("family", sort=False):
         # Refinement goes along edge lengths, whatever the axis.
@@ -90,7 +90,7 @@ def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
     gone = [shortened(name) for name in frame["family"].drop_duplicates() if name not in set(drawn["family"])]
     families = f"families not drawn: {few_of(gone)}" if gone else ""
     set_title(axes, f"order {order:g}", _absent(frame, selection.x), families)
-    axes.set(xlabel=escaped(label_of(selection.x, study_unit(selection.tree))), ylabel="relative Sobolev distance")
+    axes.set(xlabel=escaped(label_of(selection.x, unit_of(selection.tree)[0])), ylabel="relative Sobolev distance")
 
 
 def draw_rates(found: xr.Dataset, order: float | None, axes: Axes) -> None:
@@ -102,7 +102,7 @@ def draw_rates(found: xr.Dataset, order: float | None, axes: Axes) -> None:
     rows = (found.sel(order=chosen) if "order" in found.dims else found).sortby("edge_length")
     rows = rows.isel(mesh=np.flatnonzero((rows["relative"] > 0) & (rows["edge_length"] > 0)))
     places, values = rows["edge_length"].values, rows["relative"].values
-    set_log_scale(axes, "xy")
+    set_log_scale(axes, "xy", " %")
     draw_curve(axes, places, values, rows["relative_error"].values, style_of(0), "meshes")
     if len(places) > 1:
         _draw_slope(axes, places, values, _SLOPES["edge_length"])
@@ -165,7 +165,7 @@ def moving_families(selection: Selection) -> list[str]:
 
 def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
     """Draw the mean of each method of a league with its interval, and all meshes as dots, at their sizes."""
-    set_log_scale(axes, "xy")
+    set_log_scale(axes, "xy", " %" if league.y == RELATIVE else "")
     # The legend has the order of the table.
     for method in league.table["method"]:
         style, (sizes, means) = style_of(league.methods.index(method)), league.mean_curve(method)
@@ -178,7 +178,7 @@ def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
 
 def draw_cost_league(_leagues: Sequence[CostLeague], league: CostLeague, axes: Axes) -> None:
     """Draw the mean relative distance of each member of a league by cost against its mean cost, and their front."""
-    set_log_scale(axes, "xy")
+    set_log_scale(axes, "xy", " %")
     methods, means = league.meshes["method"].drop_duplicates().tolist(), league.means
     for number, method in enumerate(methods):
         rows = means[means["method"] == method]
@@ -209,7 +209,7 @@ def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
     spectra, (width, height) = selection.spectra, inches(axes)
     shares, bands = spectra["share"].sel(order=order).values, spectra["text"].values.tolist()
     image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
-    bar = axes.figure.colorbar(image, ax=axes, format=PercentFormatter(1.0, 0))
+    bar = axes.figure.colorbar(image, ax=axes, format=PercentFormatter(1.0, 0, " %"))
     bar.set_label("fraction of the\nsquared distance", fontsize="small")
     labels, row_points = [shortened(label) for label in spectra["mesh"].values], 72 * 0.8 * height / len(shares)
     label_points = min(_LABEL_POINTS, row_points)

@@ -15,11 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogFormatterSciNotation
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, write_file, written
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.tables.text import middle_cut
+from sobolev_batch.tables.text import middle_cut, number_text
 from sobolev_batch.visible import visible
 
 # Width and height in inches.
@@ -138,10 +139,24 @@ def inches(axes: Axes) -> Size:
     return float(place.width * figure.bbox.width / figure.dpi), float(place.height * figure.bbox.height / figure.dpi)
 
 
-def set_log_scale(axes: Axes, names: Literal["x", "y", "xy"]) -> None:
-    """Make axes logarithmic, with small labels between powers of ten, and a grid."""
+class _PlainNumbers(LogFormatterSciNotation):
+    """Labels of a logarithmic axis without powers of ten where they can be read, of fractions in per cent."""
+
+    unit = ""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        value = 100 * x if self.unit else x
+        text = super().__call__(value, pos)
+        return f"{number_text(value) if 1e-4 <= value < 1e6 else text}{self.unit}" if text else ""
+
+
+def set_log_scale(axes: Axes, names: Literal["x", "y", "xy"], unit: Literal["", " %"] = "") -> None:
+    """Make axes logarithmic, with small labels between powers of ten, and a grid; the vertical one may be in %."""
     for name in names:
         axes.set(**{f"{name}scale": "log"})
+        for set_formatter in (axis := getattr(axes, f"{name}axis")).set_major_formatter, axis.set_minor_formatter:
+            set_formatter(numbers := _PlainNumbers())
+            numbers.unit = unit if name == "y" else ""
         axes.tick_params(axis=name, which="both", labelsize="small")  # type: ignore[arg-type]
     # Labels of less than a decade would overlap.
     axes.tick_params(axis="x", which="minor", labelsize="xx-small")

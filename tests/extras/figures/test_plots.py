@@ -101,6 +101,14 @@ def test_what_cannot_be_plotted(
         plot(xr.DataTree.from_dict({**tree.to_dict(), "/distances": nearest}), **arguments)
 
 
+def test_relative_distances_are_in_per_cent(tree: xr.DataTree) -> None:
+    axes = sb.plot.convergence(tree, order=-10.0)
+    axes.figure.draw_without_rendering()
+    labels = [text.get_text() for text in axes.get_yticklabels(which="both") if text.get_text()]
+    assert {"3 %", "10 %"} < {*labels}
+    assert all(label.endswith(" %") for label in labels)
+
+
 def lines(_subject: object, count: int, axes: Axes) -> None:
     set_log_scale(axes, "xy")
     for i in range(count):
@@ -263,10 +271,10 @@ def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
 
 def test_axes_name_the_unit_of_the_files(tree: xr.DataTree) -> None:
     tree.attrs = root_attributes(0.02, length_unit="$mm$")
-    assert sb.plot.convergence(tree).get_xlabel() == r"mean edge length in units of 50 \$mm\$"
+    axes, edges = sb.plot.convergence(tree, -10.0), sb.table(tree, -10.0)["edge_length"].dropna()
+    assert axes.get_xlabel() == r"mean edge length in \$mm\$"
+    assert np.sort(axes.lines[0].get_xdata()) == pytest.approx(50 * np.sort(edges))
     tree.attrs = root_attributes(0.02)
-    assert sb.plot.convergence(tree).get_xlabel() == "mean edge length in units of 50 file units"
-    tree.attrs = root_attributes()
     assert sb.plot.convergence(tree).get_xlabel() == "mean edge length in file units"
     assert sb.plot.convergence(tree, x="triangles").get_xlabel() == "number of triangles"
 
