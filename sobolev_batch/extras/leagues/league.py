@@ -188,6 +188,28 @@ class League:
         frame["nearer"] = np.where(frame["p"] < statistics.SIGNIFICANCE, nearer, "")
         return frame
 
+    def verdict(self, order_text: Callable[[float], str] = "{:g}".format) -> str:
+        """Return a sentence on the nearest method, as far as intervals and the test permit it; nothing of others."""
+        if self.y != RELATIVE:
+            return ""
+        names, count = self.table["method"].tolist(), len(self.objects)
+        leaders = self.table["method"][self.table["rank"] == 1].tolist()
+        first, amount = names[0], percent_text(self.table[RELATIVE][0])
+        over = f"over {count} objects" if count > 1 else f"on {self.objects[0]}"
+        over += f" at order {order_text(self.order)}"
+        if len(names) == 1:
+            return f"{first} differs from the references by {amount} {over}."
+        if len(leaders) == 1 and (self.pairs["nearer"] == first).sum() == len(names) - 1:
+            return f"{first} is nearest to the references {over}: it differs by {amount}."
+        if len(leaders) == 1:
+            doubt = "but the test of pairs does not tell it from all others"
+            return f"{first} has the smallest mean {over}, {amount}, {doubt}."
+        if count == 1:
+            return f"{first} is nearest {over}: it differs by {amount}. One object ranks no methods."
+        named = f"{', '.join(leaders[:-1])} and {leaders[-1]}"
+        among = named if len(leaders) <= _MOST_REASONS else f"{len(leaders)} of {len(names)} methods"
+        return f"The intervals do not separate {among} {over}. {first} has the smallest mean, {amount}."
+
     def __str__(self) -> str:
         """Return what `sobolev-batch table league` prints of it."""
         return format_league([self])
@@ -399,7 +421,8 @@ def _curves(frame: pd.DataFrame, order: float, x: str, y: str, methods: Sequence
 def format_league(leagues: Sequence[League], style: Format = "text") -> str:
     """Return leagues as text; see `league`."""
     frame = pd.concat([one.table.assign(order=one.order) for one in leagues], ignore_index=True)
-    sections = [Section(one.caption, [(league_columns(one.y), one.table)], pair_lines(one)) for one in leagues]
+    sections = [Section(sentences=[line for one in leagues for line in wrapped(one.verdict())])]
+    sections += [Section(one.caption, [(league_columns(one.y), one.table)], pair_lines(one)) for one in leagues]
     notes = wrapped(league_note(leagues))
     notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
     return rendered(style, frame[["order", *frame.columns.drop("order")]], sections, notes)

@@ -17,7 +17,7 @@ from sobolev_batch.batch.status import status
 from sobolev_batch.errors import InputError, from_extra, write_file
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution, has_times
-from sobolev_batch.extras.leagues.league import League, percent_text
+from sobolev_batch.extras.leagues.league import League
 from sobolev_batch.extras.leagues.statistics import label_of
 from sobolev_batch.parameters import path_of
 from sobolev_batch.shown import together
@@ -154,7 +154,7 @@ def page_template(name: str) -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"duration": duration, "minus": minus, "percent": percent_text}
+    environment.filters["duration"] = duration
     return environment.get_template(f"{name}.html.jinja")
 
 

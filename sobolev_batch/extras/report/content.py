@@ -199,7 +199,7 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
     orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
     one = objects.location.below(objects.names[0])
     by_order = {league.order: league for league in leagues}
-    of_objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
+    of_objects = [row for s in orders for row in sorted(_object_rows(tables, s, by_order.get(s)), key=_worst_first)]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
     deviations = [row for league in by_deviation for row in _rows(league, "table")]
     methods = leagues[0].methods if leagues else list(dict.fromkeys(pd.concat(tables.values())["family"]))
@@ -211,6 +211,7 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
         "versions": versions,
         **cost_content(tables, methods),
         "leagues": leagues,
+        "sentences": [league.verdict(lambda order: minus(f"{order:g}")) for league in leagues],
         "no_league": no_league,
         "differences": tuple(tuple(pair_lines(one)) for one in leagues),
         "note": league_note(leagues).replace("\n", " ") if leagues else "",
@@ -246,6 +247,10 @@ def _rows(league: League | CostLeague, name: Literal["table", "pairs", "front"])
     frame: pd.DataFrame = getattr(league, name)
     colors = frame["method"].map(list(league.methods).index)
     return list(frame.assign(order=league.order, color=colors).to_dict(orient="records"))
+
+
+def _worst_first(row: TableRow) -> tuple[float, float]:
+    return -row["missing"], -row.get("relative", np.inf)
 
 
 def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: League | None) -> Iterator[TableRow]:
