@@ -37,7 +37,7 @@ from sobolev_batch.visible import visible
 # Processor time to start a process with all libraries, and the time until a cluster of them has started.
 _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
 # Objects that a plan looks at: the choice of a lattice takes seconds.
-_MOST_OBJECTS = 16
+_MOST_OBJECTS = 6
 _SUMMARY = ("object", "missing", "CPU time", "memory", "storage", "M + octaves")
 # Stored fields tell the speed if there are as many.
 _FEWEST_RECORDS = 3
@@ -287,7 +287,7 @@ def plan(
 
     References are loaded; where the study requests an accuracy, a few other surfaces are made and compared. In place of
     a search that is not finished, they have the mesh that it would try next. An object that cannot be carried out stops
-    no other. Of many objects, 16 unfinished ones are looked at, and others count as their mean.
+    no other. Of many objects, 6 unfinished ones are looked at, and others count as their mean.
 
     Args:
         study: Study, or the path of its file.
