@@ -36,7 +36,8 @@ def convergence(
 
     Args:
         meshes: Meshes in any form that `as_mesh` takes, in any order, with labels if they are a mapping.
-        reference: Surface that they approximate: a mesh, or one by formula such as `shapes.Sphere`.
+        reference: Surface that they approximate: a mesh, or one by formula such as `shapes.Sphere`. Orders weigh
+            wavelengths above one unit alike: of one many units large, scale all by `shapes.Similarity.to_unit_ball`.
         order: One order s < -1/2, or several.
         rtol: Largest error of each distance relative to it; see `distance`.
         lattice: Lattice to compute on, in place of an rtol.
