@@ -363,7 +363,11 @@ def _one_reference(
     if others and all(sizes[path] >= _AS_FINE * triangles or _is_called_reference(path) for path in others):
         summary.append("are these objects of their own? if so, move them into a folder called originals, and init that")
     if counts:
-        sections.append(_filled("optional" if families else "decimated", counts=counts))
+        decimated = _filled("decimated", counts=counts)
+        remark = "# Compare with decimation: remove the # in front of these lines.\n"
+        sections.append(
+            remark + re.sub("^", "# ", decimated.rstrip(), flags=re.MULTILINE) + "\n" if families else decimated
+        )
     return sections, tuple(summary)
 
 

@@ -43,7 +43,7 @@ VERDICT_COLUMNS = (
     DEVIATION,
     Column("remark", "remark", kind="text"),
 )
-_TOTALS = ("meshes", "missing", "above_rtol")
+TOTALS = ("meshes", "missing", "above_rtol")
 _OF_NEAREST = ["mesh", "relative", "relative_error", *METRICS["hausdorff"]]
 # What an object is judged by: to cut it from all columns of `table` takes much longer.
 _OF_OBJECTS = ["order", "distance", "resolved", "within", *_OF_NEAREST]
@@ -52,7 +52,7 @@ _OBJECT_COLUMNS = (
     Column("mesh", "nearest mesh", kind="text"),
     Column("relative", "relative", percent, "relative_error"),
     DEVIATION,
-    *(Column(name, name.replace("_", " "), count) for name in _TOTALS),
+    *(Column(name, name.replace("_", " "), count) for name in TOTALS),
 )
 
 
@@ -211,7 +211,7 @@ def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[Ta
 def counted(rows: pd.DataFrame) -> pd.DataFrame:
     """Return whether each row of `table` has a distance, lacks one, and has one above rtol; their sums are totals."""
     known = rows["distance"].notna()
-    return pd.DataFrame(dict(zip(_TOTALS, (known, ~known, _is_above_rtol(rows)), strict=True)))
+    return pd.DataFrame(dict(zip(TOTALS, (known, ~known, _is_above_rtol(rows)), strict=True)))
 
 
 def _is_above_rtol(rows: pd.DataFrame) -> pd.Series:
@@ -266,7 +266,7 @@ def format_objects(
     totals = rows[keys].join(counted(rows)).groupby(keys, sort=False).sum()
     known = rows[rows["relative"].notna()]
     nearest = known.loc[known.groupby(keys)["relative"].idxmin()].set_index(keys).filter(_OF_NEAREST)
-    frame = totals.join(nearest).fillna({"mesh": ""}).reset_index()[[*keys, *nearest, *_TOTALS]]
+    frame = totals.join(nearest).fillna({"mesh": ""}).reset_index()[[*keys, *nearest, *TOTALS]]
     frame = frame.sort_values(["missing", "relative"], ascending=False, kind="stable")
     sections, more = [] if len(frame) else [Section(sentences=[ALONE])], list[str]()
     place = str(source_of(store) or "STORE" if isinstance(store, xr.DataTree) else store)

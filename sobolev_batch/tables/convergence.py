@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -29,7 +30,7 @@ from sobolev_batch.tables.open import (
     unit_of,
 )
 from sobolev_batch.tables.other_orders import order_note, table_at
-from sobolev_batch.tables.rendering import Column, Section, machine_table, rendered
+from sobolev_batch.tables.rendering import Column, Section, filled, machine_table, rendered
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
 
@@ -279,9 +280,7 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame) -> Iterator[Sec
         yield Section(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", [(columns, rows)])
     once = marked.drop_duplicates("mesh")
     if "proximity" in tree.children:
-        metrics = _metrics_of(tree)
-        columns = [MESH, *(column for column in _METRIC_COLUMNS if column.name in metrics)]
-        yield Section("Other distances, the same at all orders", [(columns, once)])
+        yield Section("Other distances, the same at all orders", [((MESH, *_METRIC_COLUMNS), once)])
     connection = [column for column in CONNECTION_COLUMNS if column.name in frame]
     if once[[column.name for column in connection]].nunique().gt(1).any():
         yield Section("How triangles are connected", [((MESH, *connection), once)])
@@ -296,11 +295,10 @@ def _metrics_of(tree: xr.DataTree) -> list[str]:
     return [name for metric in metrics for name in METRICS.get(metric, ())]
 
 
-def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
-    """Return the columns whose numbers an open store has, for a page, which may be narrow."""
-    metrics = _metrics_of(tree)
-    columns = [*_COLUMNS, *(column for column in _METRIC_COLUMNS if column.name in metrics)]
-    return tuple(sorted(columns, key=lambda column: (column is not MESH, not column.is_marked)))
+def page_columns(rows: Sequence[Mapping[Any, Any]]) -> list[Column]:
+    """Return the columns that rows for a page, which may be narrow, have."""
+    columns = filled([*_COLUMNS, *_METRIC_COLUMNS], rows)
+    return sorted(columns, key=lambda column: (column is not MESH, not column.is_marked))
 
 
 def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:

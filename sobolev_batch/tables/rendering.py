@@ -102,8 +102,9 @@ def column_table(columns: Sequence[Column], rows: Rows, style: Format) -> str:
 
 
 def filled(columns: Sequence[Column], records: Sequence[Mapping[Any, Any]]) -> list[Column]:
-    """Return the columns that some row has, of texts those that some row has a text for."""
-    return [one for one in columns if any(one.text(row) if one.kind == "text" else one.name in row for row in records)]
+    """Return the columns that some row has, of texts those that some row has a text for; of no rows all columns."""
+    found = [one for one in columns if any(one.text(row) if one.kind == "text" else one.name in row for row in records)]
+    return found or [*columns]
 
 
 def machine_table(frame: pd.DataFrame, style: Format) -> str:

@@ -62,8 +62,8 @@ class StudyMeshes:
                 study = study.with_cache(MeshCache(place.absolute().beside(MADE_MESHES)))
             members = study.object.members
         except SobolevBatchError as error:
-            place = "name the folder of the study by --folder (in Python: folder=)"
-            raise InputError(f"the study's meshes cannot be listed here: {error}; {place}") from error
+            hint = "name the folder of the study by --folder (in Python: folder=)"
+            raise InputError(f"the study's meshes cannot be listed here: {error}; {hint}") from error
         return cls(tree, members, table)
 
     def make(self, label: str, most_triangles: float = math.inf) -> tuple[Mesh, Mesh]:

@@ -431,7 +431,7 @@ def format_league(leagues: Sequence[League], style: Format = "text") -> str:
 def league_note(leagues: Sequence[League]) -> str:
     """Return how to read leagues at one size; of a single method, nothing on ranks and pairs."""
     ranks = _RANKS_NOTE if any(len(one.methods) > 1 for one in leagues) else ""
-    # Tables do not show the units of numbers.
+    # Tables show no units.
     units = {one.y: VARIABLES.get(one.y, {}).get("units", NUMBER) for one in leagues}
     numbers = ", ".join(y if unit == NUMBER else f"{y} in {unit}" for y, unit in units.items())
     return _MEANS_NOTE.format(x=leagues[0].x, y=numbers) + ranks
@@ -449,13 +449,12 @@ def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
 
 
 def pair_lines(league: League) -> list[str]:
-    """Return a line for each pair of methods that differ."""
-    lines = []
-    for row in league.pairs.itertuples():
-        if row.nearer:
-            farther, ratio = (row.other, 1 / row.ratio) if row.nearer == row.method else (row.method, row.ratio)
-            less = "is {} times nearer than" if league.y == RELATIVE else f"has {{}} times less {league.y} than"
-            lines.append(f"{row.nearer} {less.format(times(ratio))} {farther} (p = {row.p:.2g}).")
+    """Return a line for each pair of methods that differ, those of the nearest method first."""
+    lines, places, pairs = [], league.table["method"].tolist(), league.pairs[league.pairs["nearer"] != ""]
+    for row in pairs.sort_values("nearer", key=lambda names: names.map(places.index), kind="stable").itertuples():
+        farther, ratio = (row.other, 1 / row.ratio) if row.nearer == row.method else (row.method, row.ratio)
+        less = "is {} times nearer than" if league.y == RELATIVE else f"has {{}} times less {league.y} than"
+        lines.append(f"{row.nearer} {less.format(times(ratio))} {farther} (p = {row.p:.2g}).")
     count, methods = len(league.objects), len(league.table)
     if not lines and methods > 1:
         least = statistics.least_objects(len(league.pairs))

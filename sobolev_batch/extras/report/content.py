@@ -24,16 +24,8 @@ from sobolev_batch.extras.leagues.league import (
     pair_lines,
 )
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, TableRow, counted, study_verdict
-from sobolev_batch.tables.convergence import (
-    CONNECTION_COLUMNS,
-    DEVIATION,
-    MESH,
-    page_columns,
-    tables_of,
-    unit_notes,
-    with_remarks,
-)
+from sobolev_batch.tables.conclusion import TOTALS, VERDICT_COLUMNS, TableRow, counted, study_verdict
+from sobolev_batch.tables.convergence import CONNECTION_COLUMNS, MESH, page_columns, tables_of, unit_notes, with_remarks
 from sobolev_batch.tables.open import doubts_of, finished_group, open_store, root_attribute, similarity_of
 from sobolev_batch.tables.rendering import Column, filled
 from sobolev_batch.tables.text import minus, number_text, percent
@@ -62,9 +54,7 @@ _OBJECT_COLUMNS = (
     Column("relative", "relative", percent, "relative_error"),
     Column("next", "next", kind="text"),
     Column("ratio", "times as far", number_text, is_marked=True),
-    Column("meshes", "meshes", "{:,}".format),
-    Column("missing", "missing", "{:,}".format),
-    Column("above_rtol", "above rtol", "{:,}".format),
+    *(Column(name, name.replace("_", " "), "{:,}".format) for name in TOTALS),
 )
 # The relative distance comes first: a narrow screen shows no more without scrolling.
 _LEAGUE_COLUMNS = tuple(sorted(league_columns(RELATIVE), key=lambda one: (one.kind != "label", one.name != RELATIVE)))
@@ -171,8 +161,8 @@ def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence
     longest = int(frame.groupby("order").size().max()) if len(frame) else 0
     rows = with_remarks(frame).groupby("order", sort=False).head(most)
     rows = rows.assign(color=rows["family"].map(families.index), reasons="failed")
-    omitted = max(0, longest - most)
-    return PageTable("convergence", page_columns(tree), rows.to_dict(orient="records"), orders, omitted=omitted)
+    omitted, records = max(0, longest - most), rows.to_dict(orient="records")
+    return PageTable("convergence", page_columns(records), records, orders, omitted=omitted)
 
 
 def _meshes_table(meshes: xr.Dataset, families: Sequence[str]) -> PageTable:
@@ -193,15 +183,15 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
         leagues, no_league = leagues_of(tables, objects.names), ""
     except InputError as error:
         leagues, no_league = (), str(error)
-    by_deviation: Sequence[League] = ()
+    deviations = list[TableRow]()
     with suppress(InputError):
-        by_deviation = leagues_of(tables, objects.names, y=DEVIATION.name)
+        deviations = [row for one in leagues_of(tables, objects.names, y="hausdorff") for row in _rows(one, "table")]
     orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
     one = objects.location.below(objects.names[0])
     by_order = {league.order: league for league in leagues}
-    of_objects = [row for s in orders for row in sorted(_object_rows(tables, s, by_order.get(s)), key=_worst_first)]
+    of_objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
+    of_objects.sort(key=lambda row: (orders.index(row["order"]), -row["missing"], -row.get("relative", np.inf)))
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
-    deviations = [row for league in by_deviation for row in _rows(league, "table")]
     methods = leagues[0].methods if leagues else list(dict.fromkeys(pd.concat(tables.values())["family"]))
     versions = root_attribute(open_store(objects.location.below(next(iter(tables)))), "versions")
     unfinished = {name: "it has no tables yet; run the study again" for name in objects.names if name not in tables}
@@ -216,7 +206,7 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
         "differences": tuple(tuple(pair_lines(one)) for one in leagues),
         "note": league_note(leagues).replace("\n", " ") if leagues else "",
         "league": PageTable("league", _LEAGUE_COLUMNS, ranked, [*by_order]),
-        "deviations": PageTable("deviations", league_columns(DEVIATION.name), deviations),
+        "deviations": PageTable("deviations", league_columns("hausdorff"), deviations),
         "unit": next(iter(tables.values())).attrs["unit"],
         "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, [*by_order]) if pairs else None,
         "objects": PageTable("objects", _OBJECT_COLUMNS, of_objects, orders),
@@ -247,10 +237,6 @@ def _rows(league: League | CostLeague, name: Literal["table", "pairs", "front"])
     frame: pd.DataFrame = getattr(league, name)
     colors = frame["method"].map(list(league.methods).index)
     return list(frame.assign(order=league.order, color=colors).to_dict(orient="records"))
-
-
-def _worst_first(row: TableRow) -> tuple[float, float]:
-    return -row["missing"], -row.get("relative", np.inf)
 
 
 def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: League | None) -> Iterator[TableRow]:

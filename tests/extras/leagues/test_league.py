@@ -269,6 +269,14 @@ def test_objects_are_named_with_the_orders_that_leave_them_out() -> None:
     assert "box is left out: a reproduced it" in format_league([some, some])
 
 
+def test_pairs_of_the_nearest_method_are_told_first() -> None:
+    rows = of_powers({"a": 4, "b": 2, "c": 1}, 1.0)
+    told = re.findall(
+        r"^(.) is (.) times nearer than (.)", format_league([ranked(dict.fromkeys("123456789", rows))]), re.M
+    )
+    assert told == [("c", "4", "a"), ("c", "2", "b"), ("b", "2", "a")]
+
+
 def test_few_objects_are_said_to_be_too_few() -> None:
     one, five, six = (ranked({f"{i}": POWERS for i in range(count)}) for count in (1, 5, 6))
     assert "The test cannot tell 2 methods from chance with 5 objects; take 6 or more." in format_league([five])
