@@ -103,6 +103,7 @@ def test_what_cannot_be_plotted(
 
 def test_relative_distances_are_in_per_cent(tree: xr.DataTree) -> None:
     axes = sb.plot.convergence(tree, order=-10.0)
+    assert isinstance(axes.figure, Figure)
     axes.figure.draw_without_rendering()
     labels = [text.get_text() for text in axes.get_yticklabels(which="both") if text.get_text()]
     assert {"3 %", "10 %"} < {*labels}
