@@ -20,9 +20,9 @@ import igl  # it reads the variable once
 _PAIR_SECONDS = 4e-7
 # Height of a triangle over its longest side below which libigl may be far off: it loses the digits of its square.
 _THIN = 0.01
-# Cosine of the angle to a pseudonormal below which rounding may have chosen the side of a point, and aspect ratio of a
-# triangle beyond which rounding may have turned it.
-_UNCLEAR, _SLIVER = 1e-6, 1e4
+# Cosine of the angle to a pseudonormal below which rounding may have chosen the side of a point, and distance from the
+# surface, in its size, below which rounding may have chosen whether it winds around a point.
+_UNCLEAR, _NEAR = 1e-6, 1e-6
 
 
 class Triangles:
@@ -142,7 +142,7 @@ def signs(mesh: Mesh, points: Reals) -> Reals | None:
     It has some if its triangles are oriented consistently, once vertices of the same place are one. Outside of an open
     mesh is the side that triangles face, and what lies beyond its border in its plane. Sources: J. A. Baerentzen, H.
     Aanaes, "Signed distance computation using the angle weighted pseudonormal" (2005), doi:10.1109/TVCG.2005.49; G.
-    Barill et al., "Fast winding numbers for soups and clouds" (2018), doi:10.1145/3197517.3201337, beside slivers.
+    Barill et al., "Fast winding numbers for soups and clouds" (2018), doi:10.1145/3197517.3201337, for closed meshes.
     """
     own = mesh.merged or mesh
     if any(own.counts[f"{kind}_edges"] for kind in ("nonmanifold", "inconsistent")):
@@ -153,7 +153,7 @@ def signs(mesh: Mesh, points: Reals) -> Reals | None:
     scale = 2.0 ** float(np.frexp(np.abs(vertices).max())[1])
     corners, triangles = vertices / scale, np.ascontiguousarray(own.triangles, dtype=np.int64)
     by_pseudonormals = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    signed, faces, closest, across = igl.signed_distance(places / scale, corners, triangles, by_pseudonormals)
+    signed, _, closest, across = igl.signed_distance(places / scale, corners, triangles, by_pseudonormals)
     is_inside = (np.reshape(signed, -1) < 0) != (own.volume < 0)
     # In the plane of a face that ends before, and beside a sliver that may be folded back, a normal tells no side.
     arms, across = (places / scale - np.reshape(closest, (-1, 3))).T, np.reshape(across, (-1, 3)).T
@@ -162,11 +162,10 @@ def signs(mesh: Mesh, points: Reals) -> Reals | None:
         # Beyond the border of a flat sheet is outside.
         is_inside &= ~is_unclear
     else:
-        thin = triangles[own.aspect_ratios > _SLIVER]
-        is_unclear |= np.isin(triangles[np.reshape(faces, -1)], thin).any(axis=1)
-        if is_unclear.any():
-            turns = igl.fast_winding_number(corners, triangles, places[is_unclear] / scale)
-            is_inside[is_unclear] = np.abs(np.reshape(turns, -1)) > 1 / 2
+        # Parts may lie within others, overlap, or be turned inside out.
+        is_unclear |= dot(arms, arms) > _NEAR**2
+        turns = igl.fast_winding_number(corners, triangles, places[is_unclear] / scale)
+        is_inside[is_unclear] = np.abs(np.reshape(turns, -1)) > 1 / 2
     return np.where(is_inside, -1.0, 1.0)
 
 

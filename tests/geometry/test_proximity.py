@@ -298,6 +298,26 @@ def test_beside_the_border_of_a_flat_sheet_is_outside() -> None:
         assert sb.vertex_distances(points, sheet, signed=True).min() > 0
 
 
+@pytest.mark.parametrize(
+    ("radius", "place", "turned"), [(0.8, 2.5, True), (0.8, 2.5, False), (0.5, 0.0, False), (0.8, 1.0, False)]
+)
+def test_parts_turned_inside_out_within_others_or_across_them_have_the_same_inside(
+    radius: float, place: float, turned: bool
+) -> None:
+    ball, rng = sb.shapes.icosphere(3), np.random.default_rng(0)
+    other = ball.triangles[:, ::-1] if turned else ball.triangles
+    vertices = np.vstack([ball.vertices, radius * ball.vertices + [place, 0, 0]])
+    both = sb.Mesh(vertices, np.vstack([ball.triangles, other + len(ball.vertices)]))
+    points = rng.uniform([-1.5, -1.5, -1.5], [3.5, 1.5, 1.5], size=(600, 3))
+    depths = [np.linalg.norm(points - [at, 0, 0], axis=1) - size for at, size in ((0, 1), (place, radius))]
+    points = points[np.min(np.abs(depths), axis=0) > 0.02][:300]
+    cloud = sb.Mesh(points, np.arange(len(points) // 3 * 3).reshape(-1, 3))
+    used, is_inside = cloud.used_vertices, np.zeros(len(points), dtype=bool)
+    for at, size in ((0, 1), (place, radius)):
+        is_inside |= np.linalg.norm(points - [at, 0, 0], axis=1) < size
+    np.testing.assert_array_equal(sb.vertex_distances(cloud, both, signed=True)[used] < 0, is_inside[used])
+
+
 @pytest.mark.parametrize("width", [0.0, 1e-16, 1e-12, 1e-9, 1e-6])
 def test_sides_do_not_depend_on_triangles_without_area(width: float) -> None:
     # A corner divides one side of an edge of a box, and a sliver closes the gap to the other side.
