@@ -105,15 +105,15 @@ class Ellipsoid(Smooth):
         """Return x(u, v), float64 (3, ...)."""
         (a, b, c), radii = self.axes, np.sqrt((1 - u) * (1 + u))
         x, y, z = self.center
-        return np.stack([x + a * radii * np.cos(v), y + b * radii * np.sin(v), z + c * u])
+        return _stacked(x + a * radii * np.cos(v), y + b * radii * np.sin(v), z + c * u)
 
     def tangents(self, u: Reals, v: Reals) -> tuple[Reals, Reals]:
         """Return x_u and x_v, float64 (3, ...) each; u must lie between the poles."""
         (a, b, c), radii = self.axes, np.sqrt((1 - u) * (1 + u))
         cosines, sines = np.cos(v), np.sin(v)
         slopes = -u / radii
-        along_u = np.stack([a * slopes * cosines, b * slopes * sines, np.full_like(u, c)])
-        return along_u, np.stack([-a * radii * sines, b * radii * cosines, np.zeros_like(u)])
+        along_u = _stacked(a * slopes * cosines, b * slopes * sines, c)
+        return along_u, _stacked(-a * radii * sines, b * radii * cosines, 0.0)
 
     def moved(self, scale: float, origin: Point) -> Self:
         """Return the ellipsoid after x -> scale * (x - origin)."""
@@ -184,14 +184,14 @@ class Torus(Smooth):
         """Return x(u, v), float64 (3, ...)."""
         radii = self.R + self.r * np.cos(v)
         x, y, z = self.center
-        return np.stack([x + radii * np.cos(u), y + radii * np.sin(u), z + self.r * np.sin(v)])
+        return _stacked(x + radii * np.cos(u), y + radii * np.sin(u), z + self.r * np.sin(v))
 
     def tangents(self, u: Reals, v: Reals) -> tuple[Reals, Reals]:
         """Return x_u and x_v, float64 (3, ...) each."""
         radii, cosines, sines = self.R + self.r * np.cos(v), np.cos(u), np.sin(u)
-        along_u = np.stack([-radii * sines, radii * cosines, np.zeros_like(u)])
+        along_u = _stacked(-radii * sines, radii * cosines, 0.0)
         slopes = -self.r * np.sin(v)
-        return along_u, np.stack([slopes * cosines, slopes * sines, self.r * np.cos(v)])
+        return along_u, _stacked(slopes * cosines, slopes * sines, self.r * np.cos(v))
 
     def moved(self, scale: float, origin: Point) -> Self:
         """Return the torus after x -> scale * (x - origin)."""
@@ -237,6 +237,11 @@ class Torus(Smooth):
         ahead, above = np.roll(corner, -1, axis=0), np.roll(corner, -1, axis=1)
         opposite = np.roll(ahead, -1, axis=1)
         return Mesh(vertices, np.stack([corner, ahead, opposite, corner, opposite, above], axis=-1).reshape(-1, 3))
+
+
+def _stacked(x: Reals, y: Reals, z: Reals | float) -> Reals:
+    """Return vectors (3, ...) of coordinates that are broadcast to one shape (...)."""
+    return np.stack(np.broadcast_arrays(x, y, z))
 
 
 def _moved(point: Point, scale: float, origin: Point) -> Point:

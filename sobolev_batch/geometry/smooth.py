@@ -115,7 +115,7 @@ class Smooth(ABC):
 
     @abstractmethod
     def positions(self, u: Reals, v: Reals) -> Reals:
-        """Return x(u, v), float64 (3, ...), at parameters of one shape (...)."""
+        """Return x(u, v), float64 (3, ...), at parameters that are broadcast to one shape (...)."""
 
     def tangents(self, u: Reals, v: Reals) -> tuple[Reals, Reals] | None:
         """Return x_u and x_v, float64 (3, ...) each; None where they are computed from positions."""
@@ -145,7 +145,7 @@ class Smooth(ABC):
 
     def _on_grid(self, u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
         """Return positions and their derivatives (3, n, m) on a grid; those of an interpolant need it whole."""
-        grid = np.meshgrid(u, v, indexing="ij")
+        grid = np.meshgrid(u, v, indexing="ij", sparse=True)
         positions, tangents = self.positions(*grid), self.tangents(*grid)
         if tangents is None:
             along_u, along_v = self.intervals
@@ -272,6 +272,8 @@ class ParametrisedSurface(Smooth):
 
     def positions(self, u: Reals, v: Reals) -> Reals:
         """Return x(u, v), float64 (3, ...)."""
+        # A function of the user may write into what it gets.
+        u, v = map(np.array, np.broadcast_arrays(u, v))
         positions = _vectors(self.position(u, v), u.shape)
         positions -= np.reshape(self.origin, (3, *[1] * u.ndim))
         positions *= self.scale

@@ -208,7 +208,7 @@ class _Parametrised(SurfaceKind):
         yield WeightedPoints.concatenated(gathered)
 
     def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
-        # With twice the nodes at which it converges, the error is about 1e-14 of the area, if half a million suffice.
+        # With more nodes than it converges with, the error is about 1e-14 of the area, if half a million suffice.
         highest = float(np.linalg.norm(frequencies, axis=1).max(initial=0.0))
         return direct_transform(self.surface, exact_counts(self.surface, highest), frequencies)
 

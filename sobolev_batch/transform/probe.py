@@ -2,7 +2,7 @@
 
 The mean of weight · |computed - exact|² / p over frequencies drawn with probability p estimates the squared norm of a
 field's error without bias (importance sampling). The exact values of a mesh are the closed form of its triangles, which
-shares neither quadrature nor NUFFT with the field; those of a parametrised surface are a sum over twice the nodes.
+shares neither quadrature nor NUFFT with the field; those of a parametrised surface are a sum over more nodes.
 """
 
 from collections.abc import Sequence
@@ -247,7 +247,7 @@ def probe_block(
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block and some of its own.
 
-    A sample at these draws saves time. The exact values of a parametrised surface come from twice its nodes, so its
+    A sample at these draws saves time. The exact values of a parametrised surface come from nodes too, so its
     probe also holds the change that the last doubling made, once for the whole field.
     """
     if not needs_probe(surface, settings):

@@ -15,16 +15,19 @@ from sobolev_batch.transform.backends import cosine_and_sine
 FINEST_CHANGE = 1e-13
 # Random sums over few nodes may agree to a few percent by chance.
 COARSEST_CHANGE = 1e-4
-# Nodes that the spacing on a surface is measured with, and nodes beyond two for each wavelength.
-_SPACING_NODES, _MARGIN, _EXTRA = 31, 1.1, 12
+# Nodes that the spacing on a surface is measured with; and nodes beyond one for each wavelength, which is the least: a
+# part of them, and some for each digit.
+_SPACING_NODES, _MARGIN, _EXTRA = 31, 1.1, 3
 # Probe frequencies (25, 3): of unit length along axes, diagonals and nine other directions, and a few shorter ones.
 _OTHERS = np.random.default_rng(20).normal(size=(9, 3))
 _OTHERS /= np.linalg.norm(_OTHERS, axis=1, keepdims=True)
 _UNIT_FREQUENCIES = np.concatenate([DIRECTIONS, _OTHERS, *(fraction * _OTHERS[:1] for fraction in (0.0, 0.3, 0.7))])
 # Pairs of a node and a frequency at a time: their temporaries stay in cache.
 _PAIRS = 1 << 18
-# The change that exact values are resolved to, and the nodes that may be spent on them.
-_EXACT_CHANGE, _MOST_EXACT_NODES = 1e-12, 1 << 19
+# Nodes along a parameter for one of those at which the other is looked at, and the fewest of these.
+_ACROSS, _FEWEST_ACROSS = 8, 63
+# The change that exact values are resolved to, the nodes that may be spent on that, and the part of them added then.
+_EXACT_CHANGE, _MOST_EXACT_NODES, _MORE = 1e-12, 1 << 19, 4
 
 
 @lru_cache(maxsize=16)
@@ -61,28 +64,29 @@ def direct_transform(surface: Smooth, counts: Counts, frequencies: Reals) -> Com
 
 @lru_cache(maxsize=16)
 def exact_counts(surface: Smooth, highest: float) -> Counts:
-    """Return twice the nodes along each parameter at which the transform converges up to a frequency."""
-    return doubled(_refined(surface, highest, _EXACT_CHANGE, _MOST_EXACT_NODES)[0])
+    """Return more nodes along each parameter than the transform converges with up to a frequency; odd numbers."""
+    u, v = _refined(surface, highest, _EXACT_CHANGE, _MOST_EXACT_NODES)[0]
+    return u + u // _MORE + _MORE | 1, v + v // _MORE + _MORE | 1
 
 
 def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tuple[Counts, float]:
     """Double the nodes along each parameter that needs it, until the change is small or the nodes are too many."""
-    counts = _first_counts(surface, highest)
+    counts = _first_counts(surface, highest, tolerance)
     if _too_many(surface, counts, most):  # even the first
         return counts, math.inf
     frequencies = highest * _UNIT_FREQUENCIES
-    values = direct_transform(surface, counts, frequencies)
     while True:
         twice = doubled(counts)
-        along = (twice[0], counts[1]), (counts[0], twice[1])
-        finer = [direct_transform(surface, more, frequencies) for more in along]
-        changes = [float(np.abs(more - values).max()) / surface.area for more in finer]
+        # Errors along one parameter show at few of the nodes along the other.
+        u, v = (min(count, max(count // _ACROSS | 1, _FEWEST_ACROSS)) for count in counts)
+        pairs = ((counts[0], v), (twice[0], v)), ((u, counts[1]), (u, twice[1]))
+        values = [[direct_transform(surface, nodes, frequencies) for nodes in pair] for pair in pairs]
+        changes = [float(np.abs(finer - coarser).max()) / surface.area for coarser, finer in values]
         coarse = [change > tolerance / 2 for change in changes]
         larger = (twice[0] if coarse[0] else counts[0], twice[1] if coarse[1] else counts[1])
         if sum(changes) <= tolerance or _too_many(surface, larger, most):
             return counts, sum(changes)
         counts = larger
-        values = finer[coarse.index(True)] if sum(coarse) == 1 else direct_transform(surface, counts, frequencies)
 
 
 def _too_many(surface: Smooth, counts: Counts, most: int) -> bool:
@@ -90,12 +94,12 @@ def _too_many(surface: Smooth, counts: Counts, most: int) -> bool:
     return math.prod(counts) > most or any(n > MOST_GAUSS_NODES and not interval.periodic for interval, n in along)
 
 
-def _first_counts(surface: Smooth, highest: float) -> Counts:
-    """Return two nodes for each wavelength where nodes are farthest apart, and some more; odd numbers."""
+def _first_counts(surface: Smooth, highest: float, tolerance: float) -> Counts:
+    """Return a node for each wavelength where nodes are farthest apart, and some more; odd numbers."""
     points = np.concatenate([batch for batch, _ in surface.nodes((_SPACING_NODES, _SPACING_NODES))], axis=1)
     grid = points.reshape(3, _SPACING_NODES, _SPACING_NODES)
     widest = (float(np.linalg.norm(np.diff(grid, axis=axis), axis=0).max()) for axis in (1, 2))
     # The numbers may exceed all bounds, and are refused then.
-    counts = (min(_MARGIN * _SPACING_NODES * width * 2 * highest, float(MOST_NODES)) for width in widest)
-    u, v = (math.ceil(count) + _EXTRA | 1 for count in counts)
+    counts = (min(_MARGIN * _SPACING_NODES * width * highest, float(MOST_NODES)) for width in widest)
+    u, v = (math.ceil(count - _EXTRA * math.log10(tolerance)) | 1 for count in counts)
     return u, v

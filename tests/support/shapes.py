@@ -116,11 +116,13 @@ class Roof(Smooth):
         return Interval(-0.9, 1.0), Interval(-0.9, 1.0)
 
     def positions(self, u: Reals, v: Reals) -> Reals:
-        return np.asarray(self.scale * (np.stack([u, v, -np.abs(u)]) - np.reshape(self.origin, (3, *[1] * u.ndim))))
+        x, y = np.broadcast_arrays(u, v)
+        return np.asarray(self.scale * (np.stack([x, y, -np.abs(x)]) - np.reshape(self.origin, (3, *[1] * x.ndim))))
 
     def tangents(self, u: Reals, v: Reals) -> tuple[Reals, Reals]:
-        one, zero = np.full_like(u, self.scale), np.zeros_like(u)
-        return np.stack([one, zero, -self.scale * np.sign(u)]), np.stack([zero, one, zero])
+        slopes, _ = np.broadcast_arrays(-self.scale * np.sign(u), v)
+        one, zero = np.full_like(slopes, self.scale), np.zeros_like(slopes)
+        return np.stack([one, zero, slopes]), np.stack([zero, one, zero])
 
     def moved(self, scale: float, origin: Point) -> Roof:
         x, y, z = (old + shift / self.scale for old, shift in zip(self.origin, origin, strict=True))

@@ -16,7 +16,7 @@ from sobolev_batch.transform import kinds, resolution
 from sobolev_batch.transform.backends import CPU
 from sobolev_batch.transform.fourier import Execution, TransformSettings, transform_block
 from sobolev_batch.transform.kinds import kind_of
-from sobolev_batch.transform.resolution import direct_transform, resolution_of
+from sobolev_batch.transform.resolution import direct_transform, exact_counts, resolution_of
 from tests.support.fake_device import Device
 from tests.support.oracles import spheroid_value, torus_value
 from tests.support.shapes import HALF_TURN, TURN, Roof, angular_ball, turned_torus
@@ -81,7 +81,9 @@ def test_the_nodes_are_enough_and_not_many_more(surface: Smooth, highest: float)
     points *= highest / np.linalg.norm(points, axis=1, keepdims=True)
     error = np.abs(direct_transform(surface, counts, points) - kind_of(surface).exact_values(points)).max()
     assert error <= 1e-9 * surface.area
-    fewer = (counts[0] // 3 | 1, counts[1] // 3 | 1)
+    finer = exact_counts(surface, highest)
+    assert math.prod(finer) < 3 * math.prod(resolution_of(surface, highest, 1e-12)[0])
+    fewer = (2 * counts[0] // 3 | 1, 2 * counts[1] // 3 | 1)
     if highest > 1:
         error = np.abs(direct_transform(surface, fewer, points) - kind_of(surface).exact_values(points)).max()
         assert error > 1e-9 * surface.area

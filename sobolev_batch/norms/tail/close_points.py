@@ -17,7 +17,7 @@ from sobolev_batch.norms.tail.potentials import SignedTriangles, centers_and_rad
 from sobolev_batch.transform.resolution import resolution_of
 
 # Cells along each parameter that a smooth surface is replaced by: the most, and how many for a node of its transform.
-_MOST_CELLS, _CELLS_PER_NODE, _TRIANGULATION_TOLERANCE = 320, 4, 1e-4
+_MOST_CELLS, _CELLS_PER_NODE, _TRIANGULATION_TOLERANCE = 320, 7, 1e-4
 # Triangles whose corners are held at a time, and the most pieces that long ones are cut into.
 _HELD, _MOST_PIECES = 1 << 18, 2_000_000
 # Triangles of a smaller fraction of a squared spacing stay whole.
@@ -260,7 +260,7 @@ def _triangulated(surface: Smooth, cutoff: float) -> Mesh:
     cells = (min(_CELLS_PER_NODE * count, _MOST_CELLS) for count in counts)
     # With the middles of cells, which tell how far facets lie from the surface.
     fine = [_grid(interval, 2 * count) for interval, count in zip(surface.intervals, cells, strict=True)]
-    positions = np.moveaxis(surface.positions(*np.meshgrid(*fine, indexing="ij")), 0, -1)
+    positions = np.moveaxis(surface.positions(*np.meshgrid(*fine, indexing="ij", sparse=True)), 0, -1)
     corners = _facing_both_sides(positions)
     rows, columns, _ = corners.shape
     first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
