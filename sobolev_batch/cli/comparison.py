@@ -108,6 +108,8 @@ class CompareOptions:
     def _check_verdict(self) -> None:
         allowed = self.allowed_fraction
         known = _KNOWN | (_KNOWN_OF_LENGTHS if allowed is None else _KNOWN_OF_FRACTIONS)
+        # The page has the distance besides.
+        known |= {"orders"} if self.report is not None else set()
         context = click.get_current_context()
         given = [
             parameter.opts[0]

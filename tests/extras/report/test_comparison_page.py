@@ -60,7 +60,9 @@ def test_its_charts_hold_what_was_measured(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_verdict_has_a_page(tmp_path: Path) -> None:
-    assert "not within 1 mm" in made_page(tmp_path, "--within", "1mm", status=1).read_text()
+    page = made_page(tmp_path, "--within", "1mm", "--order=-4", status=1).read_text()
+    assert "not within 1 mm" in page
+    assert "at order -4" in page
     done = call("compare", "in.off", NAME, "--within", "1%", "--report", "other.html", folder=tmp_path)
     assert (done.returncode, done.stdout.splitlines()[-1]) == (1, "other.html")
     assert (tmp_path / "other.html").exists()
