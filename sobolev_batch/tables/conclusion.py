@@ -117,12 +117,14 @@ def _sentence(at_order: str, rows: pd.DataFrame, known: Mapping[Any, Any]) -> st
     if closest is None:
         return f"No distance to {name} is above its error {at_order}: the meshes may be equal to it."
     best, rivals = closest
-    # The number stays on one line of the sentence.
+    # Numbers stay on one line of the sentence.
     amount = percent(best["relative"], best["relative_error"]).replace(" ", "\N{NO-BREAK SPACE}")
     who = rivals[0] if len(rivals) == 1 else f"one of {few_of(rivals)}"
     doubt = f", and the errors leave open whether {who} is nearer" if rivals else ""
-    worst = DEVIATION.text(best)
-    deviation = f" The largest deviation of {best['mesh']} is {worst} {known['unit']}." if worst else ""
+    worst = DEVIATION.text(best).replace(" ", "\N{NO-BREAK SPACE}")
+    deviation = (
+        f" The largest deviation of {best['mesh']} is {worst}\N{NO-BREAK SPACE}{known['unit']}." if worst else ""
+    )
     if compared == 1:
         return f"{best['mesh']} differs from {name} by {amount} {at_order}.{deviation}"
     nearest = f"Of {compared:,} meshes, {best['mesh']} is nearest to {name} {at_order}"

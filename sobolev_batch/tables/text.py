@@ -217,8 +217,8 @@ def line_length() -> int:
 
 
 def wrapped(text: str) -> list[str]:
-    """Return the lines of a paragraph that fits the terminal."""
-    return textwrap.wrap(" ".join(text.split()), min(line_length(), _LONGEST_PROSE))
+    """Return the lines of a paragraph that fits the terminal; no-break spaces become spaces within lines."""
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in textwrap.wrap(text, min(line_length(), _LONGEST_PROSE))]
 
 
 def beside(name: str, text: str) -> str:

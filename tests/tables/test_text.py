@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from sobolev_batch import Mesh
 from sobolev_batch.cli.comparison import answer, motion_text
 from sobolev_batch.shapes import icosphere
-from sobolev_batch.tables.text import bound, percent, with_error
+from sobolev_batch.tables.text import bound, percent, with_error, wrapped
 
 _NAN = float("nan")
 
@@ -98,6 +98,12 @@ def said(area_change: float = -0.008, **changes: float) -> str:
 def test_shares_of_area(changes: dict[str, float], area_change: float, share: str) -> None:
     remark = f"; {share} of the squared distance" if share else ""
     assert said(area_change, **changes) == f"a.obj differs from b.obj by 1.02 % ± 0.01 % at order -2{remark}."
+
+
+def test_a_number_and_its_unit_stay_on_one_line_of_a_paragraph() -> None:
+    for length in range(10, 110):
+        lines = wrapped(f"{'x' * length} differs by 0.5\N{NO-BREAK SPACE}% at most")
+        assert sum("0.5 %" in line for line in lines) == 1
 
 
 def test_distances_that_cannot_be_told_from_zero_and_unknown_errors() -> None:

@@ -194,7 +194,7 @@ class League:
             return ""
         names, count = self.table["method"].tolist(), len(self.objects)
         leaders = self.table["method"][self.table["rank"] == 1].tolist()
-        first, amount = names[0], percent_text(self.table[RELATIVE][0])
+        first, amount = names[0], percent_text(self.table[RELATIVE][0]).replace(" ", "\N{NO-BREAK SPACE}")
         over = f"over {count} objects" if count > 1 else f"on {self.objects[0]}"
         over += f" at order {order_text(self.order)}"
         if len(names) == 1:

@@ -438,7 +438,7 @@ def test_a_sentence_says_which_method_is_nearest(factors: dict[str, float], obje
     rows = method_rows({method: {n: factor / n for n in (100, 400)} for method, factor in factors.items()})
     tables = {f"o{i}": rows for i in range(objects)}
     (league,) = leagues_of(tables, list(tables))
-    assert league.verdict(lambda order: minus(f"{order:g}")) == sentence
+    assert league.verdict(lambda order: minus(f"{order:g}")).replace("\xa0", " ") == sentence
     assert " ".join(format_league([league]).split()).startswith(sentence.replace("\N{MINUS SIGN}", "-"))
     # The legend has the order of the table.
     (lines,) = build.league_data([league], "", [])["league"]

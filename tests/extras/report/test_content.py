@@ -98,7 +98,7 @@ def test_the_largest_deviation_of_the_nearest_mesh_is_told_in_the_unit_of_the_fi
     made = frame([("a", 100, 0.2), ("a", 400, 0.04)])
     made["hausdorff"], made["hausdorff_upper"], made.attrs["unit"] = [0.5, 0.25], [0.505, 0.2525], "mm"
     sentence, rows, _ = verdict_on(made)
-    assert sentence.endswith(" The largest deviation of a/400 is 0.2500 to 0.2525 mm.")
+    assert sentence.endswith(" The largest deviation of a/400 is 0.2500\xa0to\xa00.2525\xa0mm.")
     assert rows["below 5 %: a"] == ["a/400", "4.000 % ± 0.004 %", "400", "0.2500 to 0.2525", ""]
     # It may not be known of every mesh.
     made.loc[1, ["hausdorff", "hausdorff_upper"]] = np.nan
