@@ -16,12 +16,12 @@ from sobolev_batch.tables.text import percent, wrapped
 from sobolev_batch.transform.lattice import Orders
 
 _RELATIVE = ["relative", "relative_error"]
-_NAMES = ["mesh", "triangles", *_RELATIVE, "nearest", *(f"nearest_{name}" for name in _RELATIVE), "undecided"]
 _NOTE = """\
 A mesh is below the bound if its relative distance plus the error of that is.
 Smaller meshes of which the errors leave that open are named."""
 
 _UNKNOWN: dict[str, Any] = {"mesh": "", "triangles": pd.NA, "relative": math.nan, "relative_error": math.nan}
+_NAMES = [*_UNKNOWN, "nearest", *(f"nearest_{name}" for name in _RELATIVE), "undecided"]
 _COLUMNS = (
     Column("family", "family"),
     MESH,
@@ -71,8 +71,17 @@ def _of_objects(store: AnyStore, relative: float | str, order: Orders | None) ->
 
 def smallest_of(frame: pd.DataFrame, most: float) -> pd.DataFrame:
     """Return the smallest mesh of each family of triangles below a bound, of rows of `table`; see `smallest_below`."""
-    families = frame[frame["triangles"] > 0].groupby(["order", "family"], sort=False)
-    rows = [{"order": s, "family": family, **_smallest(members, most)} for (s, family), members in families]
+    rows = []
+    for (order, family), members in frame[frame["triangles"] > 0].groupby(["order", "family"], sort=False):
+        lowest, highest = (members["relative"] + sign * members["relative_error"] for sign in (-1, 1))
+        below, is_known = members[highest < most].sort_values(["triangles", "relative"]), members["relative"].notna()
+        best = _UNKNOWN if below.empty else below.iloc[0]
+        nearest = members.loc[members["relative"].idxmin()] if is_known.any() else _UNKNOWN
+        # An unknown error leaves everything open.
+        is_open = is_known & ~(highest < most) & ~(lowest >= most)
+        undecided = members[is_open if below.empty else is_open & (members["triangles"] < best["triangles"])]
+        numbers = *(best[name] for name in _UNKNOWN), *(nearest[name] for name in ("mesh", *_RELATIVE))
+        rows.append([order, family, *numbers, tuple(undecided["mesh"])])
     smallest = pd.DataFrame(rows, columns=["order", "family", *_NAMES]).astype({"triangles": "Int64"})
     smallest.attrs = {"reference": frame.attrs["reference"], "below": most}
     return smallest
@@ -89,22 +98,6 @@ def format_smallest(store: AnyStore, style: Format, orders: Sequence[float] | No
             cells = [{**row, "mesh": row["mesh"] or "none", "remark": remark(row, row["undecided"])} for row in records]
             sections.append(Section(caption, [(_COLUMNS, cells)]))
     return rendered(style, joined(frames), sections, notes_of_left_out(store, frames) + wrapped(_NOTE))
-
-
-def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:
-    lowest, highest = (members["relative"] + sign * members["relative_error"] for sign in (-1, 1))
-    below = members[highest < most].sort_values(["triangles", "relative"])
-    best = _UNKNOWN if below.empty else below.iloc[0]
-    # An unknown error leaves everything open.
-    is_open = members["relative"].notna() & ~(highest < most) & ~(lowest >= most)
-    is_fewer = True if below.empty else members["triangles"] < best["triangles"]
-    nearest = members.loc[members["relative"].idxmin()] if members["relative"].notna().any() else _UNKNOWN
-    return {
-        **{name: best[name] for name in ("mesh", "triangles", *_RELATIVE)},
-        "nearest": nearest["mesh"],
-        **{f"nearest_{name}": nearest[name] for name in _RELATIVE},
-        "undecided": tuple(members.loc[is_open & is_fewer, "mesh"]),
-    }
 
 
 def remark(row: Mapping[Any, Any], undecided: str) -> str:
