@@ -3,6 +3,7 @@
 import logging
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,15 @@ from typing import Any
 import xarray as xr
 
 from sobolev_batch.errors import InputError, StoreError, one_line
+from sobolev_batch.geometry.proximity import METRICS
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.fields import Quality
+from sobolev_batch.sources.names import quoted
 from sobolev_batch.store import layout
 from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.metadata import mapping_in
+from sobolev_batch.store.metadata import mapping_in, record_in
 from sobolev_batch.store.objects import stores_below
 from sobolev_batch.visible import FILE_UNITS
 
@@ -32,6 +35,17 @@ _SOURCE, _STATE = "source", "state"
 _LARGE = {"fourier", layout.OCTAVES_GROUP, layout.SPECTRA_GROUP}
 # What zarr and xarray raise for metadata that nobody has written.
 _MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, struct.error)
+
+
+@dataclass(frozen=True)
+class _Attributes:
+    """What is read of the attributes of a table."""
+
+    reference: str = ""
+    rtol: float = 0.0
+    numerics: tuple[int, ...] = ()
+    metadata: tuple[str, ...] = ()
+    metrics: tuple[str, ...] = ()
 
 
 def open_store(store: str | Path | Location) -> xr.DataTree:
@@ -71,6 +85,12 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
                 tree[group].dataset = with_coordinates(tree[group].to_dataset())
                 if not all(index.is_unique for index in tree[group].indexes.values()):
                     raise ValueError(f"labels of {group} come twice")
+                own = record_in(_Attributes, tree[group].attrs, f"{location}: what {group} says of itself")
+                unknown = {*own.metadata} - tree[group].variables.keys() | {*own.metrics} - METRICS.keys()
+                if group == "convergence" and not has_objects:
+                    unknown |= {own.reference} - {*tree[group].indexes["mesh"]}
+                if unknown:
+                    raise ValueError(f"{group} names {quoted(min(unknown))}, which is not there")
             # The processes of a Dask client do not see the memory of this one.
             for group in () if opened.location.is_in_memory else _LARGE.intersection(tree.children):
                 lazy = xr.open_dataset(keys, group=group, engine="zarr", consolidated=True, zarr_format=3, chunks={})

@@ -290,6 +290,21 @@ def test_a_reference_that_is_no_mesh_is_named(copy: Path) -> None:
             use(copy)
 
 
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [("convergence", "reference", value) for value in (None, 3, "nobody", ["reference"])]
+    + [("convergence", "rtol", value) for value in ("much", None, [0.1])]
+    + [("convergence", "numerics", 17)]
+    + [("meshes", "metadata", value) for value in ("family", 3, ["nothing"], [["family"]], {"family": 1})],
+)
+def test_what_tables_say_of_themselves_is_checked(group: str, name: str, value: Any, copy: Path) -> None:
+    # Whoever forges it makes a digest that fits.
+    change(copy, group, lambda node: node["attributes"].update({name: value}))
+    Store.open(copy).consolidate()
+    with pytest.raises(DamageError, match=f"{group} "):
+        open_store(copy)
+
+
 def test_a_number_of_no_row_is_that_of_a_mesh_without_record(copy: Path) -> None:
     Store.open(copy).write("meshes/row", [0], [-6, 1, 2, 3, 4])
     assert not verify(copy).is_sound
