@@ -287,7 +287,8 @@ def _stl_text_corners(data: bytes) -> Reals:
                     raise MeshError(f"facet {facet} has a vertex of {len(words) - 1} coordinates, expected three")
                 corners.extend(reals(words[1:], f"facet {facet}"))
                 facet_corners += 1
-            case _ if "endfacet" in line.lower().split()[1:]:
+            # A solid may have any of these words for its name.
+            case _ if {"vertex", "endfacet"} <= {*line.lower().split()[1:]}:
                 raise MeshError(f"after facet {facet}: a facet ends within a line")
             case "solid" | "endsolid" as word:
                 in_solid = word == "solid"

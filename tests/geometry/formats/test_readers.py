@@ -290,6 +290,7 @@ VARIANTS: dict[str, dict[str, bytes]] = {
         "the vertices on a line": re.sub(rb"\n(?=vertex.*\nendloop|vertex.*\nvertex.*\nendloop)", b" ", STL_BOX),
         "the end behind the last facet": STL_BOX.replace(b"facet\nends", b"facet ends"),
         "a name like a word": stl_text(BOX_VERTICES, BOX_TRIANGLES, "facet normal"),
+        "a name like an end": stl_text(BOX_VERTICES, BOX_TRIANGLES, "endfacet"),
         "capitals": STL_BOX.upper(),
         "two zeros": STL_BOX.replace(b"vertex 0.0 0.0 0.0", b"vertex -0.0 0.0 -0.0", 1),
         "one line": STL_BOX.replace(b"\n", b" "),
