@@ -274,8 +274,10 @@ def call_function(mesh: Mesh, function: Callable[..., Any] | str, parameters: Ma
     made: Mesh | str
     try:
         made = as_mesh(function(mesh, **parameters))
-    # Libraries end the process where they fail to read, which would be that of the worker.
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    # Libraries end the process where they fail to read, which would be that of the worker; those in Rust panic.
+    except BaseException as error:
         made = f"{function_name(function)}: {type(error).__name__}: {one_line(error)}"
     return Cost(time.perf_counter() - started, time.thread_time() - processor), made
 

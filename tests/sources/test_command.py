@@ -257,6 +257,8 @@ def test_formats_of_other_remeshers(tmp_path: Path) -> None:
     [
         (RuntimeError("no convergence"), "broken: RuntimeError: no convergence$"),
         (SystemExit(3), "broken: SystemExit: 3$"),
+        # So do panics of libraries in Rust.
+        (BaseException("panicked"), "broken: BaseException: panicked$"),
         (SilentError(), "broken: SilentError: SilentError$"),
         (RuntimeError("long " * 10**6), "^.{1000,3000}$"),
     ],
