@@ -92,8 +92,9 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     The reference is the mesh that is called original, reference, target or ground truth, or else the one with the most
     triangles. Each folder is a family; the meshes of a single folder are families by their names without the number at
     the end. Where several files are called references and others belong to them by name, the study has several
-    objects, and so it has where the names of files begin as those of finer ones, in any folder. References alone are
-    compared with decimated versions of themselves. Files are looked at, and only small ones are read.
+    objects, and so it has where the names of files begin as those of finer ones, in any folder, or where the finest
+    files of all folders have one name. References alone are compared with decimated versions of themselves. Files are
+    looked at, and only small ones are read.
 
     Args:
         folder: Folder with meshes, in it or in folders below.
@@ -232,7 +233,7 @@ def _references(sizes: Mapping[PurePosixPath, int], *, are_all: bool = False) ->
     some have files of their names, or where there are no other files at all.
     """
     called = [path for path in sizes if are_all or _is_called_reference(path)]
-    references = {_object_of(path): path for path in called} or _continued(sizes)
+    references = {_object_of(path): path for path in called} or _continued(sizes) or _of_folders(sizes)
     owners = {name for name, _ in _families(sizes, references)}
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called or references)
     is_refused = any(name_problem(name, _LONGEST_NAME, RESERVED) or name.startswith((".", "__")) for name in references)
@@ -242,6 +243,18 @@ def _references(sizes: Mapping[PurePosixPath, int], *, are_all: bool = False) ->
     is_continued = any(re.match(rf"{re.escape(name)}[\W_]", own) for own in references for name in references)
     is_alone = len(called) == len(sizes) and not is_continued
     return references if is_alone else {name: path for name, path in references.items() if name in owners}
+
+
+def _of_folders(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
+    """Return the finest file of each folder, where all are of one name without a size, and much finer than the others.
+
+    Folders of methods have the sizes of their meshes in the names of these, or a reference beside them.
+    """
+    finest = {path.parent: path for path in sorted(sizes, key=lambda path: sizes[path])}
+    names, references = {mesh_stem(path) for path in finest.values()}, {*finest.values()}
+    are_finer = all(path in references or 2 * size <= sizes[finest[path.parent]] for path, size in sizes.items())
+    is_paired = len(names) == 1 and not any(map(_SIZE.search, names)) and len(sizes) >= 2 * len(finest)
+    return {folder.name: path for folder, path in finest.items()} if are_finer and is_paired else {}
 
 
 def _continued(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:

@@ -62,6 +62,7 @@ SEVERAL_OBJECTS: dict[str, tuple[list[str], str]] = {
     "methods first": (["Big Cow.ply", "COW.ply"], "{method}/{method}_{object}_{size}.ply"),
     "sizes first": (["in/Big cow.ply", "in/cow.ply"], "{size}_{object}_{method}.ply"),
     "folders of sizes": (["in/big cow.ply", "in/cow.ply"], "out/{method}/{object}/{size}.ply"),
+    "of one name": (["big cow/scan.ply", "cow/scan.ply"], "{object}/{method}_{size}.ply"),
     "beside others": (["big cow/big cow.ply", "cow/Cow.ply"], "{object}/{method}_{size}.ply"),
     "hostile": (["[o]/originals/big cow.ply", "[o]/originals/cow.ply"], "[o]/*{method}?/{object}_{size}.ply"),
 }
