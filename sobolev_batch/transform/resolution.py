@@ -16,8 +16,8 @@ FINEST_CHANGE = 1e-13
 # Random sums over few nodes may agree to a few percent by chance.
 COARSEST_CHANGE = 1e-4
 # Nodes that the spacing on a surface is measured with; and nodes beyond one for each wavelength, which is the least: a
-# part of them, and some for each digit.
-_SPACING_NODES, _MARGIN, _EXTRA = 31, 1.1, 3
+# part of them, and some for each digit. The change is to be this part of the tolerance, beside the errors of NUFFTs.
+_SPACING_NODES, _MARGIN, _EXTRA, _FIRST_CHANGE = 31, 1.1, 3, 1e-3
 # Probe frequencies (25, 3): of unit length along axes, diagonals and nine other directions, and a few shorter ones.
 _OTHERS = np.random.default_rng(20).normal(size=(9, 3))
 _OTHERS /= np.linalg.norm(_OTHERS, axis=1, keepdims=True)
@@ -101,5 +101,5 @@ def _first_counts(surface: Smooth, highest: float, tolerance: float) -> Counts:
     widest = (float(np.linalg.norm(np.diff(grid, axis=axis), axis=0).max()) for axis in (1, 2))
     # The numbers may exceed all bounds, and are refused then.
     counts = (min(_MARGIN * _SPACING_NODES * width * highest, float(MOST_NODES)) for width in widest)
-    u, v = (math.ceil(count - _EXTRA * math.log10(tolerance)) | 1 for count in counts)
+    u, v = (math.ceil(count - _EXTRA * math.log10(_FIRST_CHANGE * tolerance)) | 1 for count in counts)
     return u, v
