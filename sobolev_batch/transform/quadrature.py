@@ -1,5 +1,6 @@
 """Triangle meshes as weighted points: the rule of each triangle, and its points."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Self
@@ -13,12 +14,24 @@ from sobolev_batch.transform.backends import CPU, Backend, combine, sums_at, sum
 from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.nufft import WeightedPoints
 from sobolev_batch.transform.rule_errors import shares_vertices, tolerance_for
-from sobolev_batch.transform.rules import TriangleRule, choose_rules, fixed_rule, rule_ranges
+from sobolev_batch.transform.rules import (
+    GAUSS_NODES,
+    TriangleRule,
+    choose_gauss,
+    choose_rules,
+    fixed_rule,
+    gauss_rule,
+    rule_ranges,
+)
 
 _Corners = tuple[Array, Array, Array]
 
 # Triangles at a time: keeps the temporaries with a mid-sized rule near 50 MB.
 _TRIANGLES = 1 << 17
+# Area of an equilateral triangle over the squared distance of its corners from the centroid. A triangle is long where
+# that is this many times its area, and has rules of its own where it would take more points than some; these have a
+# part of the tolerance.
+EQUILATERAL, _LONG, _DEAR, _OF_TOLERANCE = 0.75 * math.sqrt(3), 2.0, 12.0, 0.1
 # An edge and its triangle are sorted as one integer, which takes twice the bits of a vertex and those of a triangle.
 _BITS = 63
 
@@ -90,17 +103,38 @@ def assign_rules(
     """
     if (fixed := fixed_rule(quadrature)) is not None:
         return (RuleUse(fixed, 0, np.arange(len(mesh.triangles), dtype=np.uint32)),)
+    # What is predicted of a tolerance is measured of rules for all triangles: errors of others are to be no part of it.
+    of_long = eps if tolerance is None else _OF_TOLERANCE * tolerance
     if tolerance is None:
         tolerance = tolerance_for(mesh, highest_frequency, eps, faces or FaceArrays.of_mesh(mesh), backend)
     rules, ranges = rule_ranges(tolerance, shares_vertices(mesh))
-    sizes = mesh.centroid_radii
+    sizes, wave_number, costs = mesh.centroid_radii, 2 * np.pi * highest_frequency, [rule.cost for rule in rules]
+    # Behind the rules for all triangles come the products for long ones.
+    products, count = (3, len(GAUSS_NODES), len(GAUSS_NODES)), len(rules) + 3 * len(GAUSS_NODES) ** 2
     keys = np.empty(len(sizes), dtype=np.uint16)
     # Meshes have tens of millions of triangles: temporaries are small, and four bytes for each are kept.
     for part in slices(len(sizes), _TRIANGLES):
-        splits, choice = choose_rules(2 * np.pi * highest_frequency * sizes[part], ranges)
-        keys[part] = splits * len(rules) + choice
+        splits, choice = choose_rules(wave_number * sizes[part], ranges)
+        keys[part] = splits * count + choice
+        points = np.array(costs)[choice] * 4.0**splits
+        long = np.flatnonzero((points > _DEAR) & (EQUILATERAL * sizes[part] ** 2 > _LONG * mesh.areas[part]))
+        corners = mesh.vertices[mesh.triangles[part][long]]
+        # The side opposite each corner.
+        sides = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)
+        along, across = wave_number * sides.max(axis=1), wave_number * sides.min(axis=1)
+        fewer, splits, *nodes = choose_gauss(along, across, of_long)
+        pays = fewer < points[long]
+        numbers = np.ravel_multi_index((sides.argmin(axis=1), *nodes), products) + splits * count + len(rules)
+        keys[part.start + long[pays]] = numbers[pays]
+
+    def rule_of(number: int) -> TriangleRule:
+        if number < len(rules):
+            return rules[number]
+        corner, along, across = np.unravel_index(number - len(rules), products)
+        return gauss_rule(GAUSS_NODES[along], GAUSS_NODES[across], int(corner))
+
     return tuple(
-        RuleUse(rules[key % len(rules)], key // len(rules), np.flatnonzero(keys == key).astype(np.uint32))
+        RuleUse(rule_of(key % count), key // count, np.flatnonzero(keys == key).astype(np.uint32))
         for key in np.flatnonzero(np.bincount(keys)).tolist()
     )
 
@@ -109,7 +143,7 @@ def quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners]
     """Return the four similar triangles that edge midpoints split each triangle into."""
     a, b, c = corners
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    return (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
+    return (a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)
 
 
 def _merged_points(faces: FaceArrays, rule: TriangleRule) -> WeightedPoints:

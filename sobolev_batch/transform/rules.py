@@ -16,6 +16,8 @@ FINEST_TOLERANCE = 1e-15
 # Sizes 2π|ξ|ρ of triangles (radians) at which the largest and the typical errors of rules are tabulated.
 SIZES, SIZES_ON_AVERAGE = np.geomspace(1e-4, 200.0, 160), np.geomspace(1e-3, 200.0, 64)
 TABULATED = Path(__file__).with_name("rules.npz")
+# Gauss nodes along or across a long triangle.
+GAUSS_NODES = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 96)
 # Two coordinates of a node, and the weight of all nodes that symmetry makes from it, for rules whose nodes neighbouring
 # triangles share. They solve the equations for the means of the symmetric polynomials, to all digits.
 _SHARING = {
@@ -115,13 +117,14 @@ def symmetric_rule(degree: int) -> TriangleRule:
 
 
 @cache
-def gauss_rule(points: int = 8) -> TriangleRule:
-    """Return the product of two Gauss-Legendre rules on the triangle: points² nodes, 64 in K. Koga's paper."""
-    nodes, weights = np.polynomial.legendre.leggauss(points)
-    u, v = np.meshgrid((1 + nodes) / 2, (1 + nodes) / 2, indexing="ij")
-    products = np.outer(weights, weights) / 4 * 2 * (1 - u)
-    second, third = u.ravel(), ((1 - u) * v).ravel()
-    return TriangleRule(2 * points - 2, np.stack([1 - second - third, second, third], axis=1), products.ravel())
+def gauss_rule(along: int = 8, across: int = 8, corner: int = 1) -> TriangleRule:
+    """Return the product of two Gauss-Legendre rules, towards a corner and across: 64 nodes in K. Koga's paper."""
+    (nodes, weights), (others, of_others) = map(np.polynomial.legendre.leggauss, (along, across))
+    u, v = np.meshgrid((1 + nodes) / 2, (1 + others) / 2, indexing="ij")
+    products = np.outer(weights, of_others) / 4 * 2 * (1 - u)
+    first, second = u.ravel(), ((1 - u) * v).ravel()
+    barycentric = np.roll(np.stack([first, second, 1 - first - second], axis=1), corner, axis=1)
+    return TriangleRule(2 * min(along, across) - 2, barycentric, products.ravel())
 
 
 def fixed_rule(quadrature: str | int) -> TriangleRule | None:
@@ -133,10 +136,29 @@ def fixed_rule(quadrature: str | int) -> TriangleRule | None:
     an InputError. Parametrised surfaces ignore the method.
     """
     if isinstance(quadrature, str) and quadrature in ("auto", "gauss8"):
-        return None if quadrature == "auto" else gauss_rule(8)
+        return None if quadrature == "auto" else gauss_rule()
     if isinstance(quadrature, int) and not isinstance(quadrature, bool) and 1 <= quadrature <= HIGHEST_DEGREE:
         return symmetric_rule(quadrature)
     raise InputError(f"quadrature must be auto, gauss8 or a degree from 1 to {HIGHEST_DEGREE}, found {quadrature!r}")
+
+
+@cache
+def gauss_errors() -> tuple[Reals, Reals]:
+    """Return phases (radians, n), and the errors (2, counts, n) up to them along and across, with `GAUSS_NODES` each.
+
+    The phase along is 2π|ξ| times the longest side, and that across times the shortest one, opposite the corner. The
+    error of a product, relative to the area, is at most the sum of two: that of the nodes along on (1 - u) exp(iau),
+    and that of those across on exp(ibv), for all smaller phases a and b.
+    """
+    phases, sums = np.geomspace(0.02, 400.0, 240), []
+    rules = [np.polynomial.legendre.leggauss(count) for count in GAUSS_NODES]
+    # The last one on both halves is exact.
+    most, of_most = rules[-1]
+    for nodes, weights in (*rules, (np.concatenate([most - 1, most + 1]) / 2, np.tile(of_most / 2, 2))):
+        waves = np.exp(0.5j * np.outer(phases, nodes))
+        sums.append([waves @ (weights / 2 * (1 - nodes) ** power) for power in (1, 0)])
+    errors = np.abs(np.array(sums[:-1]) - np.array(sums[-1]))
+    return phases, np.maximum.accumulate(np.moveaxis(errors, 1, 0), axis=2)
 
 
 @lru_cache(maxsize=64)
@@ -195,6 +217,23 @@ def tabulated() -> dict[str, Reals]:
     """
     with np.load(TABULATED, allow_pickle=False) as stored:  # noqa: TID251
         return {name: stored[name] for name in stored.files}
+
+
+def choose_gauss(along: Reals, across: Reals, tolerance: float) -> tuple[Reals, Indices, Indices, Indices]:
+    """Return the points of the cheapest product rules for phases along and across triangles (n,), see `gauss_errors`.
+
+    With them come how often edges are halved, and the places of both numbers in `GAUSS_NODES`.
+    """
+    phases, errors = gauss_errors()
+    # Each may have half of the tolerance. More nodes do at least as well, whatever rounding hides.
+    within = (errors <= max(tolerance, FINEST_TOLERANCE) / 2).sum(axis=2)
+    limits, nodes = np.maximum.accumulate(np.append(0.0, phases)[within], axis=1), np.array(GAUSS_NODES)
+    splits = np.maximum(np.ceil(np.log2(along / max(limits[:, -1].min(), phases[0]))), 0).astype(np.int64)
+    first, second = (
+        np.minimum(np.searchsorted(ranges, np.ldexp(own, -splits)), len(nodes) - 1)
+        for ranges, own in zip(limits, (along, across), strict=True)
+    )
+    return nodes[first] * nodes[second] * 4.0**splits, splits, first, second
 
 
 def choose_rules(sizes: Reals, ranges: Reals) -> tuple[Indices, Indices]:

@@ -266,3 +266,26 @@ def test_each_place_gets_the_weights_of_all_its_triangles(
     shared = [places[:, zeros == count].reshape(-1, 3).round(12) for count in (1, 2)]
     merged = sum(len(np.unique(group, axis=0)) for group in shared)
     assert np.count_nonzero(points.weights) <= merged + np.count_nonzero(zeros == 0) * len(mesh.triangles)
+
+
+@pytest.mark.parametrize("eps", [1e-4, 1e-9])
+@pytest.mark.parametrize("aspect", [10.0, 100.0])
+def test_long_triangles_take_points_by_their_area(aspect: float, eps: float) -> None:
+    # Strips of two triangles each, side by side, whose errors add up; each triangle begins at another corner.
+    rng, count, highest = np.random.default_rng(4), 20, 25.0
+    x, ends = np.linspace(-1, 1, count + 1), np.array([-0.5, 0.5]) * aspect * 2 / count
+    vertices = [[at, y, 0.1 * at] for y in ends / ends[1] for at in x]
+    first = np.arange(count)
+    triangles = np.concatenate(
+        [[first, first + 1, first + count + 2], [first, first + count + 2, first + count + 1]], 1
+    )
+    turns = (rng.integers(3, size=(2 * count, 1)) + np.arange(3)) % 3
+    mesh = Mesh(np.array(vertices) * [20 / aspect, 1, 1], np.take_along_axis(triangles.T, turns, axis=1))
+    frequencies = rng.normal(size=(40, 3))
+    frequencies *= highest / np.linalg.norm(frequencies, axis=1)[:, None]
+    frequencies[:3] = highest * np.eye(3)
+    plan = kind_of(mesh, highest, eps)
+    assert plan.expected_points <= 6 * mesh.area * (2 * highest) ** 2 + 1000 * len(mesh.triangles)
+    (points,) = plan.batches(1 << 22)
+    found = np.exp(-2j * np.pi * (frequencies @ points.coordinates)) @ points.weights
+    assert np.abs(found - exact_transform(mesh, frequencies)).max() <= eps * mesh.area

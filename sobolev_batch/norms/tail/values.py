@@ -16,6 +16,7 @@ from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSet
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import OctaveLattice
 from sobolev_batch.transform.probe import norms_of_checks
+from sobolev_batch.transform.quadrature import EQUILATERAL
 
 # Samples at which values on a lattice are checked: for small meshes, for huge ones, and in between as many as make this
 # number of pairs of a triangle (or point) and a frequency.
@@ -26,8 +27,8 @@ _POINT_SECONDS, _SAMPLE_SECONDS = 2e-7, 1e-7
 _LOOP_SECONDS, _ARRAY_SECONDS, _START_SECONDS = 3e-9, 4.5e-8, 0.15
 # Quadrature points for each square of half a wavelength, and for each triangle at least.
 POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
-# Area of an equilateral triangle over the squared distance of its corners from the centroid.
-_EQUILATERAL = 0.75 * math.sqrt(3)
+# Points of long triangles, in those of as much area that is not.
+_OF_LONG = 2.0
 # What a frequency costs beside its triangles, in triangles.
 _OVERHEAD_TRIANGLES = 50
 # Draws of an octave, for the time that one of them takes.
@@ -113,7 +114,7 @@ class SurfaceSize:
 
     Attributes:
         extent: Area in squared units of length; of triangles, if they were equilateral with the same distance from
-            centroid to farthest corner, since long ones take points like those.
+            centroid to farthest corner, but at most twice their own.
         is_closed_form: True if transforms take no points.
     """
 
@@ -126,7 +127,8 @@ class SurfaceSize:
         """Return the size of a surface."""
         kind, extent = kind_of(surface), surface.area
         if isinstance(kind.surface, Mesh):
-            extent = _EQUILATERAL * float(np.square(kind.surface.centroid_radii).sum())
+            whole = EQUILATERAL * np.square(kind.surface.centroid_radii)
+            extent = float(np.minimum(whole, _OF_LONG * kind.surface.areas).sum())
         return cls(kind.triangles, extent, kind.is_closed_form)
 
     @property
