@@ -49,7 +49,7 @@ _TRIAL_LEVEL, _TRIAL_LATTICE = 5, Lattice(5.0, 64)
 _NANO = 1e-9
 # Raise it whenever the numbers for a given surface and settings change, or the surface that is read from a file: stored
 # fields of another version are then computed again instead of being compared with new ones.
-NUMERICS_VERSION = 17
+NUMERICS_VERSION = 18
 
 _log = logging.getLogger(__name__)
 
