@@ -118,6 +118,8 @@ def assign_rules(
         keys[part] = splits * count + choice
         points = np.array(costs)[choice] * 4.0**splits
         long = np.flatnonzero((points > _DEAR) & (EQUILATERAL * sizes[part] ** 2 > _LONG * mesh.areas[part]))
+        if not long.size:
+            continue
         corners = mesh.vertices[mesh.triangles[part][long]]
         # The side opposite each corner.
         sides = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)

@@ -17,7 +17,7 @@ FINEST_TOLERANCE = 1e-15
 SIZES, SIZES_ON_AVERAGE = np.geomspace(1e-4, 200.0, 160), np.geomspace(1e-3, 200.0, 64)
 TABULATED = Path(__file__).with_name("rules.npz")
 # Gauss nodes along or across a long triangle.
-GAUSS_NODES = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 96)
+GAUSS_NODES = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 96, 128, 192, 256)
 # Two coordinates of a node, and the weight of all nodes that symmetry makes from it, for rules whose nodes neighbouring
 # triangles share. They solve the equations for the means of the symmetric polynomials, to all digits.
 _SHARING = {
@@ -150,7 +150,7 @@ def gauss_errors() -> tuple[Reals, Reals]:
     error of a product, relative to the area, is at most the sum of two: that of the nodes along on (1 - u) exp(iau),
     and that of those across on exp(ibv), for all smaller phases a and b.
     """
-    phases, sums = np.geomspace(0.02, 400.0, 240), []
+    phases, sums = np.geomspace(0.02, 1000.0, 260), []
     rules = [np.polynomial.legendre.leggauss(count) for count in GAUSS_NODES]
     # The last one on both halves is exact.
     most, of_most = rules[-1]
