@@ -253,5 +253,5 @@ def test_the_page_about_test_suites_runs(
     monkeypatch.chdir(tmp_path)
     assert len(blocks("docs/testing.md", "python")) == 3
     results = run_blocks("docs/testing.md")
-    assert capsys.readouterr().out.startswith("same surface: relative distance at most 0.35 % at order -2")
+    assert capsys.readouterr().out.startswith("same surface: relative distance 0.27 % ± 0.07 % at order -2")
     results["test_mesher"]((96, 48))

@@ -187,7 +187,7 @@ def _filled(value: Any, placeholder: str, name: str) -> Any:
 def _matching(template: str, folder: Path) -> list[str]:
     """Return the files that a template may name, as it would have them."""
     found = matching_files(folder, _PLACEHOLDERS.sub("*", template))
-    return [(path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix() for path in found]
+    return [(path if Path(template).is_absolute() else path.relative_to(folder)).as_posix() for path in found]
 
 
 def _pattern(template: str) -> str:

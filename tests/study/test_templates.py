@@ -56,6 +56,8 @@ def test_files_give_objects_and_methods(folder: Path) -> None:
     # One object's name begins with that of another: a file is of the longest name that fits.
     assert files(found, folder, "cow", "quick") == ["cow_100", "cow_200"]
     assert files(found, folder, "cow_2", "quick") == ["cow_2_100"]
+    absolute = {"source": "files", "paths": [str(folder / "objects/{object}.ply")]}
+    assert methods(sb.Study.from_table(table(reference=absolute), folder=folder)) == methods(found)
 
 
 @pytest.mark.parametrize(
