@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from itertools import chain, product, starmap, takewhile
 from pathlib import Path, PurePosixPath
 from string import Template
+from textwrap import indent
 
 from sobolev_batch.batch.start import MADE_MESHES
 from sobolev_batch.errors import MeshError, StudyError, written
@@ -376,11 +377,8 @@ def _one_reference(
     if others and all(sizes[path] >= _AS_FINE * triangles or _is_called_reference(path) for path in others):
         summary.append("are these objects of their own? if so, move them into a folder called originals, and init that")
     if counts:
-        decimated = _filled("decimated", counts=counts)
-        remark = "# Compare with decimation: remove the # in front of these lines.\n"
-        sections.append(
-            remark + re.sub("^", "# ", decimated.rstrip(), flags=re.MULTILINE) + "\n" if families else decimated
-        )
+        decimated, remark = _filled("decimated", counts=counts), "remove the # in front of these lines"
+        sections.append(f"# Compare with decimation: {remark}.\n{indent(decimated, '# ')}" if families else decimated)
     return sections, tuple(summary)
 
 

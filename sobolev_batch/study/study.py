@@ -274,9 +274,7 @@ class Study:
     @property
     def commands(self) -> tuple[str, ...]:
         """Commands that it runs to make its meshes, as a shell would have them, each once."""
-        found = (
-            (str(one.folder.absolute()), source.commands) for one in self.objects.values() for source in one.sources
-        )
+        found = ((str(one.folder), source.commands) for one in self.objects.values() for source in one.sources)
         return tuple(dict.fromkeys(text.replace("{folder}", folder) for folder, commands in found for text in commands))
 
     @property

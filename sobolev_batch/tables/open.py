@@ -39,7 +39,7 @@ _MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticEr
 
 @dataclass(frozen=True)
 class _Attributes:
-    """What is read of the attributes of a table."""
+    """Attributes of a table that are read."""
 
     reference: str = ""
     rtol: float = 0.0
